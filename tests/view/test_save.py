@@ -27,6 +27,7 @@ from evsplat.view.viewed_run import ViewedRun  # noqa: E402
 
 from ..export.clouds import read_ply, read_spz  # noqa: E402
 from ..small_model import built, small_config  # noqa: E402
+from .test_page_messages import CAMERA  # noqa: E402
 
 SIDE = 48
 
@@ -95,20 +96,7 @@ def in_browser(run, port, act, size=(SIDE, SIDE)):
             address, subprotocols=protocol, max_size=None, compression=None
         ) as socket:
             browser = Browser(socket)
-            await browser.send(
-                **{
-                    "type": "ViewerCameraMessage",
-                    "wxyz": (1.0, 0.0, 0.0, 0.0),
-                    "position": (0.0, 0.0, -3.0),
-                    "fov": 0.8,
-                    "near": 0.01,
-                    "far": 100.0,
-                    "image_height": size[1],
-                    "image_width": size[0],
-                    "look_at": (0.0, 0.0, 0.0),
-                    "up_direction": (0.0, -1.0, 0.0),
-                }
-            )
+            await browser.send(**CAMERA | {"image_width": size[0], "image_height": size[1]})
             return await act(browser)
 
     viewer = Viewer([run], host="127.0.0.1", port=port)
@@ -196,3 +184,53 @@ def test_gaussians_come_in_every_format_and_as_the_parts_that_are_shown(run, tmp
     glb = files["person and scene", "glTF"]
     magic, version, length = struct.unpack("<4sII", glb.read_bytes()[:12])
     assert (glb.suffix, magic, version, length) == (".glb", b"glTF", 2, glb.stat().st_size)
+
+
+def test_values_that_a_control_cannot_have_are_taken_back_and_told_in_a_line(run, caplog, capfd):
+    """Of a page that is broken; what is drawn and saved after that is as it was before."""
+    impossible = {
+        "Time, ms": 1e18,
+        "Divider": -1e9,
+        "Speed": "never",
+        "Colours": "<b>",
+        "Compare with": "x" * 150,
+        "Motion": "../../etc",
+        "Format": "exe",
+        "Recorded by": "no such camera",
+    }
+
+    async def act(browser):
+        before = await browser.download("Picture (PNG)")
+        for label, value in impossible.items():
+            await browser.set(label, value)
+        gaussians = await browser.download("Gaussians")
+        return before, await browser.download("Picture (PNG)"), gaussians
+
+    before, after, (name, _) = in_browser(run, 18680, act)
+    assert before == after and name.endswith(".ply")
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(said) == len(impossible)
+    assert all("cannot be chosen" in line and len(line) < 200 for line in said)
+    assert "Traceback" not in "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize(
+    "junk", [{"fov": float("nan")}, {"position": (float("inf"), 0, 0)}, {"image_width": 10**9}]
+)
+def test_a_browser_whose_camera_is_none_is_left_and_others_go_on(run, caplog, capfd, junk):
+
+    async def act(browser):
+        host, port = browser.socket.remote_address[:2]
+        protocol = [f"viser-v{viser.__version__}"]
+        async with websockets.connect(f"ws://{host}:{port}", subprotocols=protocol) as other:
+            await other.send(msgspec.msgpack.encode(CAMERA | junk))
+            with pytest.raises(websockets.exceptions.ConnectionClosed):
+                while True:
+                    await asyncio.wait_for(other.recv(), 10)
+        return await browser.download("Picture (PNG)")
+
+    _, content = in_browser(run, 18690, act)
+    assert Image.open(io.BytesIO(content)).size == (SIDE, SIDE)
+    (said,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert said.startswith("The viewer closed a connection: no message of its page (ValueError: ")
+    assert "Traceback" not in "".join(capfd.readouterr())

@@ -137,15 +137,31 @@ def test_asking_never_waits_for_a_picture_and_a_bad_picture_ends_nothing(caplog)
     assert "could not be drawn" in caplog.text
 
 
-def test_a_job_that_fails_leaves_the_others_to_the_next_step():
+def test_a_job_that_fails_costs_a_line_and_leaves_the_others(caplog):
     scheduler, done = RenderScheduler(), []
     for job in (lambda: done.append(1), lambda: 1 // 0, lambda: done.append(2)):
         scheduler.submit(job)
-    with pytest.raises(ZeroDivisionError):
-        scheduler.step()
-    assert done == [1]
     assert scheduler.step() == 0 and done == [1, 2]
     assert scheduler.step() is None
+    (record,) = caplog.records
+    assert "ZeroDivisionError" in record.getMessage() and record.exc_info is None
+
+
+@pytest.mark.parametrize("fails", ["request", "render"])
+def test_a_browser_that_cannot_be_drawn_takes_nothing_from_the_others(scheduler, caplog, fails):
+    def broken(*_, **__):
+        raise ValueError("no\nnumber")
+
+    bad, good = Client("bad"), Client("good")
+    setattr(bad, fails, broken)
+    for client in (bad, good):
+        scheduler.add(client)
+    for request in range(20):
+        good.wanted = request
+        _run(scheduler, 0.5)
+    assert [drawn for _, drawn, draft in good.drawn if not draft] == list(range(20))
+    said = [record.getMessage() for record in caplog.records]
+    assert said == ["A picture could not be drawn or saved (ValueError: no number)."]
 
 
 @pytest.mark.parametrize("nanoseconds_per_pixel", [20, 100, 300])

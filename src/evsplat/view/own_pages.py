@@ -16,7 +16,9 @@ from urllib.parse import urlsplit
 
 import websockets.asyncio.server
 
+from evsplat.view.page_messages import MOST_BYTES, check_message
 from evsplat.view.served_page import found_when_seen
+from evsplat.wording import in_a_line
 
 logger = logging.getLogger(__name__)
 
@@ -44,8 +46,9 @@ def refusal(origins: Sequence[str], hosts: Sequence[str], listens_at: str) -> st
 def own_pages_alone(listens_at: str) -> Iterator[None]:
     """Servers of websockets that are started in the block refuse other pages.
 
-    Their own finds them again when it is seen (`found_when_seen`). Messages that are none end their
-    connection with one line in the log. viser has no setting for any of it.
+    Their own finds them again when it is seen (`found_when_seen`). Messages that are none of it
+    (`check_message`) end their connection with one line in the log. viser has no setting for any
+    of it.
     """
     module: Any = websockets.asyncio.server
     serve = module.serve
@@ -63,7 +66,7 @@ def own_pages_alone(listens_at: str) -> Iterator[None]:
             answer = process_request(connection, request) if process_request else None
             return None if answer is None else found_when_seen(answer)
 
-        rest["logger"] = silent
+        rest["logger"], rest["max_size"] = silent, MOST_BYTES
         return serve(_said_in_a_line(handler), *arguments, process_request=judged, **rest)
 
     with _one_at_a_time:
@@ -79,28 +82,31 @@ def log_in_a_line(loop: asyncio.AbstractEventLoop) -> None:
 
     def failed(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        logger.warning("The viewer could not follow a message (%s).", _short(error or context))
+        logger.warning("The viewer could not follow a message (%s).", in_a_line(error or context))
 
     loop.call_soon_threadsafe(loop.set_exception_handler, failed)
 
 
 def _said_in_a_line(handler: Any) -> Any:
     async def handled(connection: Any) -> None:
+        receive = connection.recv
+
+        async def received(*arguments: Any, **options: Any) -> Any:
+            message = await receive(*arguments, **options)
+            check_message(message)
+            return message
+
+        connection.recv = received
         try:
             await handler(connection)
         except Exception as error:
             logger.warning(
-                "The viewer closed a connection: no message of its page (%s).", _short(error)
+                "The viewer closed a connection: no message of its page (%s).", in_a_line(error)
             )
             logger.debug("", exc_info=True)
             await connection.close(1003)
 
     return handled
-
-
-def _short(error: object) -> str:
-    text = f"{type(error).__name__}: {error}" if isinstance(error, BaseException) else str(error)
-    return " ".join(text.split())[:120]
 
 
 def _name(host: str) -> str:

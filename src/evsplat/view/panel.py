@@ -17,6 +17,7 @@ from evsplat.staging.assets import motions
 from evsplat.view.camera import BrowserCamera, forward, letterboxed, vertical_fov
 from evsplat.view.client import Client
 from evsplat.view.compositor import comparisons
+from evsplat.view.controls import when_changed
 from evsplat.view.request import Playback
 from evsplat.view.save_panel import SavePanel
 
@@ -102,11 +103,11 @@ class Panel:
         async def looped(_: viser.GuiEvent) -> None:
             self._loop()
 
-        self.slider.on_update(moved)
+        when_changed(self.slider, moved)
         self.play.on_click(pressed)
         self.steps.on_click(stepped)
-        self.speed.on_update(faster)
-        self.loop.on_update(looped)
+        when_changed(self.speed, faster)
+        when_changed(self.loop, looped)
 
     def _build_camera(self) -> None:
         names = tuple(self.capture.cameras)
@@ -117,7 +118,7 @@ class Panel:
         async def see(_: viser.GuiEvent) -> None:
             self.look_through(self.camera.value)
 
-        self.camera.on_update(see)
+        when_changed(self.camera, see)
         snap.on_click(see)
 
     def _build_show(self) -> None:
@@ -146,7 +147,7 @@ class Panel:
 
         layout.visible = divider.visible = window.visible = False
         for control in (parts, shown, compare, layout, divider, events, window):
-            control.on_update(changed)
+            when_changed(control, changed)
 
     def _build_pose(self) -> None:
         """A choice of motions that ship, and sliders on top, per group of joints."""
@@ -163,7 +164,7 @@ class Panel:
                 for member in members:
                     limit = float(member.limit)
                     slider = gui.add_slider(f"{member.label}, \u00b0", -limit, limit, 1.0, 0.0)
-                    slider.on_update(turned)
+                    when_changed(slider, turned)
                     sliders.append(slider)
         reset = gui.add_button("Pose as in the motion", icon=viser.Icon.RESTORE)
         reset.visible = bool(sliders)
@@ -176,7 +177,7 @@ class Panel:
                 # viser's property has a setter, which type checkers do not see.
                 slider.value = 0.0  # type: ignore[misc]
 
-        motion.on_update(chosen)
+        when_changed(motion, chosen)
         reset.on_click(straightened)
 
     def look_through(self, camera: str) -> None:

@@ -13,6 +13,7 @@ from evsplat.export.gaussians import FileKind, facts_of, file_rotation, write_fi
 from evsplat.files import scratch_folder
 from evsplat.film.camera_path import camera_path_document
 from evsplat.view.client import Client
+from evsplat.view.controls import when_changed
 from evsplat.view.request import ViewRequest
 
 _FORMATS: dict[str, tuple[FileKind, str]] = {
@@ -32,6 +33,7 @@ class SavePanel:
         self.client, gui = client, client.handle.gui
         picture = gui.add_button("Picture (PNG)", icon=viser.Icon.DOWNLOAD)
         self.format = gui.add_dropdown("Format", tuple(_FORMATS))
+        when_changed(self.format, _nothing)
         gaussians = gui.add_button("Gaussians", icon=viser.Icon.DOWNLOAD)
         self._keys: list[Camera] = []
         add_key = gui.add_button("Add key frame of a camera path", icon=viser.Icon.PLUS)
@@ -113,3 +115,7 @@ class SavePanel:
 
     def _notify(self, title: str, body: str) -> None:
         self.client.handle.add_notification(title, body, auto_close_seconds=6)
+
+
+async def _nothing(_: viser.GuiEvent) -> None:
+    """The choice is read when it is needed."""

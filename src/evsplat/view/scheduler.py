@@ -6,9 +6,11 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 from evsplat.view.request import ViewRequest
+from evsplat.wording import in_a_line
 
 logger = logging.getLogger(__name__)
 
@@ -16,6 +18,8 @@ SETTLED_S = 0.15
 """A view that stood still for so long is drawn again in full quality."""
 MIN_INTERVAL_S = 1 / 30
 """Pictures of a client follow each other no faster."""
+_AFTER_FAILURE_S = 1.0
+"""What could not be drawn is tried again no sooner."""
 MIN_SCALE = 0.3
 _SCALE_STEP = 2**-0.25
 """Ratio of neighbouring draft scales."""
@@ -60,6 +64,8 @@ class RenderScheduler:
         self._closed = False
         self._jobs: list[Callable[[], None]] = []
         self._thread: threading.Thread | None = None
+        self._said = ""
+        """What failed last, in words."""
 
     def start(self) -> None:
         """Start the render thread."""
@@ -111,15 +117,27 @@ class RenderScheduler:
             # The client that waited longest comes first.
             states = sorted(self._states.values(), key=lambda state: state.drawn_s)
         for _ in range(jobs):
-            with self._condition:  # one that fails leaves the others to the next step
+            with self._condition:
                 job = self._jobs.pop(0)
-            job()
+            self._tried(job)
         pause: float | None = 0.0 if jobs else None
         for state in states:
-            wait = self._draw(state)
+            wait = self._tried(partial(self._draw, state))
             if wait is not None:
                 pause = wait if pause is None else min(pause, wait)
         return pause
+
+    def _tried(self, work: Callable[[], float | None]) -> float | None:
+        """What ``work`` gives; where it fails a line says so, and others are drawn all the same."""
+        try:
+            return work()
+        except Exception as error:
+            said = in_a_line(error)
+            if said != self._said:  # what fails may do so at every picture
+                logger.warning("A picture could not be drawn or saved (%s).", said)
+            self._said = said
+            logger.debug("", exc_info=True)
+            return _AFTER_FAILURE_S
 
     def _draw(self, state: _ClientState) -> float | None:
         now = self._clock()
@@ -145,11 +163,7 @@ class RenderScheduler:
                 if self._closed:
                     return
                 self._notified = False
-            try:
-                pause = self.step()
-            except Exception:  # one bad picture must not end the view of everybody
-                logger.exception("A picture could not be drawn.")
-                pause = 1.0
+            pause = self.step()
             if pause == 0.0:
                 continue
             with self._condition:
