@@ -1,7 +1,10 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from evsplat.importers.base import shrunk
+from evsplat.errors import ConfigError
+from evsplat.importers.base import chosen_frames, shrunk
 
 
 def test_a_smaller_picture_holds_rounded_means_of_each_channel():
@@ -31,3 +34,10 @@ def test_shares_of_a_mask_are_not_rounded(shape):
 def test_by_a_factor_of_one_a_picture_is_given_back_itself():
     pixels = np.zeros((3, 3), np.uint8)
     assert shrunk(pixels, 1) is pixels
+
+
+@pytest.mark.parametrize("frames", [(5, 5), (7, 2)])
+def test_frames_that_end_before_they_begin_are_told_so(frames):
+    with pytest.raises(ConfigError, match=r"^--frames \d \d: expected the first frame and the one"):
+        chosen_frames(frames, list(range(10)), Path("clip.mp4"))
+    assert chosen_frames((5, 6), list(range(10)), Path("clip.mp4")) == [5]

@@ -63,6 +63,13 @@ def test_runs_one_level_below_are_named(tmp_path: Path) -> None:
         check_run_folder(tmp_path)
 
 
+def test_a_capture_in_the_place_of_a_run_is_told_with_what_makes_one_of_it(tmp_path: Path) -> None:
+    (tmp_path / "capture.json").touch()
+    said = rf"{tmp_path}: a capture, expected a run; .*: evsplat train {tmp_path} --out RUN\.$"
+    with pytest.raises(DataError, match=said):
+        check_run_folder(tmp_path)
+
+
 def test_a_training_that_prepares_its_first_step_is_told_from_no_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

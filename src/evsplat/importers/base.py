@@ -234,6 +234,11 @@ def chosen_frames(frames: tuple[int, int] | None, available: list[int], source: 
     if frames is None:
         return available
     start, stop = frames
+    if stop <= start:
+        raise ConfigError(
+            f"--frames {start} {stop}: expected the first frame and the one after the last, above "
+            "it; correct them."
+        )
     kept = [number for number in available if start <= number < stop]
     if not kept:
         raise ConfigError(

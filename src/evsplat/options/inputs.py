@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from evsplat.commands import command
 from evsplat.errors import DataError
 from evsplat.training_sign import is_training
 
@@ -74,6 +75,9 @@ def check_run_folder(path: Path) -> None:
             f"{path}: its training is still being prepared, expected one that has made a step; "
             "wait for the first one, or open 'evsplat view', which waits by itself."
         )
+    if (path / "capture.json").exists():
+        train = command("train", path, "--out", "RUN")
+        raise DataError(f"{path}: a capture, expected a run; make one of it with: {train}.")
     raise DataError(f"{path}: not a run folder, config.yaml is missing.{_runs_below(path)}")
 
 

@@ -224,7 +224,7 @@ def test_a_bag_without_events_says_what_it_holds(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no event messages.*std_msgs/msg/String"):
         open_recording(tmp_path / "e.bag")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(DataError, match="without metadata.yaml"):
+    with pytest.raises(DataError, match="without metadata.yaml is no .* give the file in it"):
         read_events(tmp_path / "folder")
 
 

@@ -1,5 +1,6 @@
 """Two recordings in one file, as of bags that were put together: told, and either one is read."""
 
+import gzip
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -171,3 +172,24 @@ def test_parts_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds 100 events"):
         convert_recording(tmp_path / "e.h5", tmp_path / "out.h5", skip=200)
     assert not (tmp_path / "out.h5").exists()
+
+
+@pytest.mark.parametrize("header", ["t,x@320,y@240,on\n", "320 240\n", "a\n# b\n"])
+@pytest.mark.parametrize("zipped", [False, True])
+def test_text_files_that_were_put_together_are_told_with_where_to_cut(
+    tmp_path: Path, header: str, zipped: bool
+) -> None:
+    separator = "," if "," in header else " "
+    texts = [
+        header + "".join(f"{separator.join(map(str, row))}\n" for row in encoders.rows(s))
+        for s in (random_stream(seed, 40, first_us=1_000) for seed in (11, 12))
+    ]
+    data = "".join(texts).encode()
+    path = tmp_path / "e.txt"
+    path.write_bytes(gzip.compress(data) if zipped else data)
+    said = f"another recording begins at byte {len(texts[0])}, .*cut it there"
+    with pytest.raises(DataError, match=said) as refusal:
+        read_events(path, time_unit="us", columns="t,x,y,p")
+    assert ("gunzip it" in str(refusal.value)) == zipped
+    path.write_bytes(data[len(texts[0]) :])
+    assert len(read_events(path, time_unit="us", columns="t,x,y,p")) == 40

@@ -83,7 +83,10 @@ def find_format(path: Path, name: str | None = None) -> Format:
     if path.is_dir():
         # a ROS 2 bag is a folder
         if not (path / "metadata.yaml").is_file():
-            raise DataError(f"{path}: a folder without metadata.yaml is no recording.")
+            raise DataError(
+                f"{path}: a folder without metadata.yaml is no recording, expected a file, or the "
+                "folder of a ROS 2 bag; give the file in it."
+            )
         head = b"SQLite format 3\0"
     else:
         head = peek(path, _HEAD_BYTES)

@@ -6,7 +6,14 @@ import numpy as np
 
 from evsplat.compiled import native_for
 from evsplat.errors import DataError
-from evsplat.events.formats.base import SAY_COLUMNS, ByteReader, RawEvents, Source
+from evsplat.events.formats.base import (
+    SAY_COLUMNS,
+    ByteReader,
+    RawEvents,
+    Source,
+    is_gzipped,
+    two_recordings,
+)
 from evsplat.events.formats.table import (
     NO_POLARITY,
     assumed_unit,
@@ -155,7 +162,10 @@ class Text(Source):
             columns,
         )
         if error:
-            line = text[taken:].split(b"\n", 1)[0][:60].decode("latin-1")
+            found = text[taken:].split(b"\n", 1)[0]
+            if found.strip() in self._file.header:
+                raise two_recordings(self.path, start + taken, zipped=is_gzipped(self.path))
+            line = found[:60].decode("latin-1")
             what = (
                 f"the line of event {first + rows} at byte {start + taken} {_ERRORS[error]} "
                 f"(field {field + 1} of {self._file.fields}: {line!r})"

@@ -36,6 +36,8 @@ class TextFile:
     """The first lines, (N, fields) float64."""
     whole_times: list[bool]
     """Per field, whether all of the sample is written without a fraction."""
+    header: tuple[bytes, ...]
+    """Lines before the first event, without blanks around them."""
 
 
 def inspect_text(path: Path) -> TextFile:
@@ -44,6 +46,7 @@ def inspect_text(path: Path) -> TextFile:
     A file with a header that names columns and no line after it is an empty recording.
     """
     names: list[str] = []
+    header: list[bytes] = []
     size: tuple[int | None, int | None] = (None, None)
     with ByteReader(path) as reader:
         for _ in range(_MAX_HEADER_LINES):
@@ -52,7 +55,7 @@ def inspect_text(path: Path) -> TextFile:
             if not raw:
                 if names:
                     empty = np.zeros((0, len(names)))
-                    return TextFile("", len(names), start, names, *size, empty, [])
+                    return TextFile("", len(names), start, names, *size, empty, [], ())
                 raise DataError(f"{path}: holds no events.")
             if start == 0 and raw.startswith(BOM_UTF8):  # as Windows begins a text
                 raw, start = raw[len(BOM_UTF8) :], len(BOM_UTF8)
@@ -62,6 +65,7 @@ def inspect_text(path: Path) -> TextFile:
             if not fields or not fields[0]:
                 continue
             is_comment = line[:1] in (b"#", b"%")
+            header.append(line)
             if is_comment or not all(_NUMBER.fullmatch(field) for field in fields):
                 if not is_comment and not all(_NAME.fullmatch(field) for field in fields):
                     raise DataError(
@@ -86,6 +90,7 @@ def inspect_text(path: Path) -> TextFile:
                 *size,
                 sample,
                 whole,
+                tuple(header[:-1]),
             )
     raise DataError(
         f"{path}: no line of numbers among its first {_MAX_HEADER_LINES} (the last is "
