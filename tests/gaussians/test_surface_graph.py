@@ -102,7 +102,10 @@ def test_nothing_jumps_between_limbs_or_through_a_plate():
     assert -alike[:25, 25:].sum() > 0.3 * -np.triu(alike[:25, :25], 1).sum()
 
 
-def test_the_other_side_is_linked_where_the_skeleton_has_sides():
+@pytest.mark.parametrize("aside", [0.0, 0.7])
+def test_the_other_side_is_linked_where_the_skeleton_has_sides(aside):
+    """``aside``: how far from the origin the body stands."""
+    shift = torch.tensor([aside, 0, 0])
     names = ("root", "LeftArm", "RightArm")
     places = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [-0.3, 0, 0]])
     body = Body(
@@ -110,16 +113,17 @@ def test_the_other_side_is_linked_where_the_skeleton_has_sides():
         faces=torch.tensor([[0, 1, 2], [1, 2, 3]]),
         weights=torch.full((4, 3), 1 / 3),
         parents=torch.tensor([-1, 0, 0]),
-        rest_joints=places,
+        rest_joints=places + shift,
         joint_names=names,
     )
     plane = mirror_plane(body)
     assert plane is not None
     assert torch.allclose(plane[1].abs(), torch.tensor([1.0, 0, 0]))
-    assert torch.allclose(plane[0], torch.zeros(3))
+    assert torch.allclose(plane[0], shift, atol=1e-6)
     points = torch.cat(
         [grid(0.0) + torch.tensor([0.2, 0, 0]), grid(0.0) - torch.tensor([0.24, 0, 0])]
     )
+    points = points + shift
     normals, bones = UP.expand(50, 3), torch.ones(50, 1)
     apart = laplacian(points, normals, bones, None).toarray()
     linked = laplacian(points, normals, bones, plane).toarray()

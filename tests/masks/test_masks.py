@@ -74,6 +74,16 @@ def test_background_keeps_away_from_shadows_and_other_movers(tiny_capture: Facto
     assert largest[21:49, 42:54].all() and not largest[:16, 78:].any()
 
 
+@pytest.mark.parametrize("channel", [0, 1, 2])
+def test_what_differs_by_less_than_the_threshold_in_each_channel_is_the_background(channel) -> None:
+    background = 0.2 + 0.5 * torch.rand(20, 30, 3, generator=torch.Generator().manual_seed(channel))
+    image = background.clone()
+    image[:, 10:20, channel] += 0.07  # brighter: no shadow
+    image[:, 20:, channel] += 0.09
+    differs = difference(image, background, 0.08)
+    assert not differs[:, :20].any() and differs[:, 20:].all()
+
+
 def test_the_middle_of_the_body_is_the_person_even_where_nothing_differs() -> None:
     body = np.zeros((40, 40), dtype=bool)
     body[5:35, 10:30] = True

@@ -5,13 +5,15 @@ import logging
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from evsplat.training import load_run, loop, train
 from evsplat.training.checkpoint import latest_checkpoint, load_checkpoint
-from evsplat.training.outlook import FIRST, PARTS, REST, SPAN, Outlook
+from evsplat.training.clock import Clock
+from evsplat.training.outlook import FIRST, PARTS, REST, SETTLED, SPAN, Outlook
 from evsplat.training.trainer import Trainer
 
 from ..conftest import write_tiny_capture
@@ -144,3 +146,17 @@ def test_a_run_killed_behind_its_turn_ends_as_one_that_was_not(ended, tmp_path, 
         (expected, state), (found, again) = ends
         assert again["clock"]["ends_at"] == state["clock"]["ends_at"] == state["clock"]["iteration"]
         assert [name for name in expected if not torch.equal(expected[name], found[name])] == []
+
+
+@pytest.mark.parametrize(
+    ("fall", "ends"),
+    [(None, False), (1.2 * SETTLED, False), (SETTLED, False), (0.8 * SETTLED, True), (-1.0, True)],
+)
+@pytest.mark.parametrize("may", [True, False])
+def test_the_end_is_brought_forward_where_the_loss_falls_by_little_alone(fall, ends, may):
+    clock = Clock(200, may_end_early=may, iteration=99, fraction=99 / 200)
+    outlook = SimpleNamespace(fall=lambda before, after: fall)
+    trainer = SimpleNamespace(clock=clock, outlook=outlook)
+    Trainer.advance(trainer, None, 0.1)
+    assert clock.iteration == 100
+    assert clock.ends_at == (100 + round(REST * 200) if ends and may else 0)
