@@ -14,10 +14,9 @@ from jaxtyping import Float32, UInt8
 from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud
 from evsplat.files import write_bytes
+from evsplat.models.networks.spherical_harmonics import SH_CONSTANT
 from evsplat.pictures.light import decode
 
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc."""
 _LEAST_OPACITY = 1e-6
 """Opacities are kept this far from 0 and 1, whose logits are infinite."""
 _SPLAT_ROW = np.dtype(
@@ -41,7 +40,7 @@ def write_ply(path: Path | str, cloud: SplatCloud, *, comments: Sequence[str] = 
     columns = {
         **dict(zip("xyz", cloud.means.T, strict=True)),
         **{name: np.zeros(len(cloud)) for name in ("nx", "ny", "nz")},
-        **{f"f_dc_{k}": (cloud.rgb[:, k] - 0.5) / SH_C0 for k in range(3)},
+        **{f"f_dc_{k}": (cloud.rgb[:, k] - 0.5) / SH_CONSTANT for k in range(3)},
         "opacity": np.log(opacity / (1 - opacity)),
         **{f"scale_{k}": np.log(cloud.scales[:, k]) for k in range(3)},
         **{f"rot_{k}": cloud.quaternions[:, k] for k in range(4)},
@@ -91,7 +90,7 @@ def write_spz(path: Path | str, cloud: SplatCloud) -> None:
             f"{path}: a Gaussian lies {reach:g} m from the origin; an .spz file holds coordinates "
             "up to 8388 km. Export the person alone with --parts human, or write a .ply."
         )
-    f_dc = (cloud.rgb - 0.5) / SH_C0
+    f_dc = (cloud.rgb - 0.5) / SH_CONSTANT
     parts = (
         _fixed_point(cloud.means, bits),
         _bytes(cloud.opacities * 255),
@@ -160,7 +159,7 @@ def write_gltf(
         f"{_GLTF_EXTENSION}:ROTATION": cloud.quaternions[:, [1, 2, 3, 0]],
         f"{_GLTF_EXTENSION}:SCALE": cloud.scales,
         f"{_GLTF_EXTENSION}:OPACITY": cloud.opacities[:, None].clip(0, 1),
-        f"{_GLTF_EXTENSION}:SH_DEGREE_0_COEF_0": (cloud.rgb - 0.5) / SH_C0,
+        f"{_GLTF_EXTENSION}:SH_DEGREE_0_COEF_0": (cloud.rgb - 0.5) / SH_CONSTANT,
         "_SEMANTIC": cloud.semantic[:, None],
     }
     views: list[dict[str, Any]] = []

@@ -15,10 +15,8 @@ from evsplat.models.hugs.triplane import (
     Triplane,
 )
 from evsplat.models.networks.skinning_network import SkinningTurns
-from evsplat.models.networks.spherical_harmonics import sh_basis
+from evsplat.models.networks.spherical_harmonics import SH_CONSTANT, sh_basis
 
-SH_CONSTANT = 0.28209479177387814
-"""The constant spherical harmonic; colour is 0.5 more than its multiple, as 3DGS."""
 START_MULTIPLIER = 0.5
 """Factor of every Gaussian's standard deviations at the start."""
 

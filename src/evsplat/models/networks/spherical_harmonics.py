@@ -4,6 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+SH_CONSTANT = 0.28209479177387814
+"""The constant harmonic: files and models of 3DGS keep a colour as 0.5 + this times a number."""
+
 
 def sh_basis(
     directions: Float[Tensor, "*batch 3"], degree: int = 3, constant: bool = False
@@ -17,7 +20,7 @@ def sh_basis(
     if not 0 <= degree <= 3:
         raise ValueError(f"degree is {degree}, expected 0..3")
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, 0.28209479177387814)] if constant else []
+    values = [torch.full_like(x, SH_CONSTANT)] if constant else []
     if degree >= 1:
         c1 = 0.4886025119029199
         values += [-c1 * y, c1 * z, -c1 * x]
