@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from evsplat.models.correctives import bake_correctives
+from evsplat.models.correctives import COMPONENTS, bake_correctives
 
 JOINTS, COUNT, POSES = 5, 60, 40
 
@@ -43,6 +43,19 @@ def test_no_pose_gets_more_than_the_recorded_ones_and_far_ones_get_nothing():
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     far = baked.shares(_poses(5) @ half_turn)
     assert far.abs().max() < 1e-3 * baked.most.abs().max()
+
+
+def test_of_many_fields_the_largest_are_kept():
+    rng = np.random.default_rng(8)
+    sizes = np.array([3.0] * COMPONENTS + [0.01] * 6)
+    changes = _changes(np.linalg.qr(rng.normal(size=(POSES, len(sizes))))[0] * sizes, 8)
+    baked = bake_correctives(changes, _poses(8))
+    assert baked.values.shape == (COMPONENTS, COUNT, 4)
+    # Of another basis of the same space: what any large field is, the kept ones add up to.
+    kept = (baked.values.float() * baked.steps[:, None]).flatten(1).double()
+    whole = changes.flatten(1).double()
+    left = whole - whole @ torch.linalg.pinv(kept) @ kept
+    assert left.square().sum() < 0.01 * whole.square().sum()
 
 
 def test_a_single_pose_is_kept_as_it_is():

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from evsplat.body import body_box
 from evsplat.capture import Policy, TrainingCapture, load_body_track
@@ -47,7 +49,7 @@ from evsplat.methods.starts import (
     human_start,
     scene_start,
 )
-from evsplat.models.paper import Semantics
+from evsplat.models.paper import PaperModel, Semantics
 from evsplat.objectives import EventChange, Objective, RenderedSemantics
 from evsplat.ranges import Above, AtLeast, ReadIf
 
@@ -126,7 +128,6 @@ def build(
     refuse_masks(config.policy, "paper")
     # First of all, since it refuses a capture without events, and the fits below take minutes.
     events = [_events(config, capture)] if config.event_weight != 0.0 else []
-    fit = purpose == "train"
     generator = start_of_randomness(seed)
     track = load_body_track(capture)
     times_us = [frame.mid_us for frame in capture.train_frames]
@@ -151,13 +152,8 @@ def build(
         device=device,
         purpose=purpose,
     )
-    if fit and config.scene.kind == "median_backdrop":
-        steps = config.scene.prefit_steps
-        camera = capture.camera(capture.train_frames[0]).to(device)
-        picture = capture.median_background().to(device)
-        gaussians, network = model.gaussians, model.scene_colour
-        fit_scene_colours(network, gaussians, camera, colours.to(device), steps, generator)
-        fit_scene(gaussians, camera, picture, steps, low_pass=model.low_pass, network=network)
+    if purpose == "train" and config.scene.kind == "median_backdrop":
+        _fit_backdrop(model, capture, colours, config.scene.prefit_steps, generator)
 
     objectives: list[Objective] = [pictures, *events]
     if config.semantics == "rendered":
@@ -177,6 +173,21 @@ def build(
         body_frames=None if config.semantics == "fixed" else body_frames(track, times_us),
         generator=generator,
     )
+
+
+def _fit_backdrop(
+    model: PaperModel,
+    capture: TrainingCapture,
+    colours: Float[Tensor, "S 3"],
+    steps: int,
+    generator: torch.Generator,
+) -> None:
+    """The scene as in the median of the frames; its network first learns the ``colours`` alone."""
+    gaussians, network, device = model.gaussians, model.scene_colour, model.device
+    camera = capture.camera(capture.train_frames[0]).to(device)
+    picture = capture.median_background().to(device)
+    fit_scene_colours(network, gaussians, camera, colours.to(device), steps, generator)
+    fit_scene(gaussians, camera, picture, steps, low_pass=model.low_pass, network=network)
 
 
 def _events(config: PaperConfig, capture: TrainingCapture) -> EventChange:

@@ -190,7 +190,10 @@ def scene_start(
     background: Backdrop | None = None,
     goes_on: bool = False,
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Start values of the scene's Gaussians, and the colours they shall show.
+    """Start values of the scene's Gaussians, and the colours, sRGB, that they shall show.
+
+    The colours are those of the cube's points, or of the rows within the backdrop's picture, which
+    come first.
 
     ``background``: what a backdrop shows instead of the median of the training frames.
     ``goes_on``: a backdrop goes on beyond the borders of the recorded picture.
