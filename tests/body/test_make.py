@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from evsplat.body import default_body, make_body
+from evsplat.body.make import shape_like
 from evsplat.body.tree import joint_depths, tree_levels
 from evsplat.errors import DataError
 
@@ -21,6 +23,33 @@ def test_default_body_is_a_person_and_follows_its_shape_directions():
     middle = 0.5 * (plus.rest_vertices + minus.rest_vertices)
     assert torch.allclose(middle, body.rest_vertices, atol=1e-5)  # linear in betas
     assert torch.allclose(0.5 * (plus.rest_joints + minus.rest_joints), body.rest_joints, atol=1e-5)
+
+
+def lengths(joints: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """Upper arms, forearms, shins and the breadth between the shoulders, metres."""
+    at = dict(zip(names, joints, strict=True))
+    bones = [("Arm", "ForeArm"), ("ForeArm", "Hand"), ("Leg", "Foot")]
+    pairs = [(f"{side}{a}", f"{side}{b}") for a, b in bones for side in ("Left", "Right")]
+    pairs.append(("LeftArm", "RightArm"))
+    return np.array([np.linalg.norm(at[a] - at[b]) for a, b in pairs])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_body_like_a_skeleton_has_its_lengths_wherever_it_stands_and_faces(seed):
+    rng = np.random.default_rng(seed)
+    shape = 1.5 * rng.normal(size=10)
+    somebody, middling = default_body(shape), default_body()
+    joints = somebody.rest_joints.double().numpy()
+    turned = joints @ Rotation.random(rng=seed).as_matrix().T + rng.normal(size=3)
+    found = shape_like(somebody.joint_names, somebody.parents.tolist(), turned)
+    like = default_body(found)
+    names = somebody.joint_names
+    wanted, got, mean = (
+        lengths(body.rest_joints.double().numpy(), names) for body in (somebody, like, middling)
+    )
+    # A coefficient costs as much as a centimetre of one length.
+    assert np.abs(got - wanted).mean() < 0.4 * np.abs(mean - wanted).mean()
+    assert np.linalg.norm(found) <= np.linalg.norm(shape)
 
 
 def test_too_many_betas_are_refused():
