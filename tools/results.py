@@ -34,6 +34,8 @@ KEPT = ROOT / "docs" / "results"
 PAGES = ("README.md", "docs/bench.md", "docs/results.md")
 FIGURE = ROOT / "docs" / "images" / "convergence.png"
 LONGER = ROOT / "benchmarks" / "knee.yaml"
+TWICE_AGAIN = "_16000"
+"""Ends the names of its rows that ran twice as long as the others there."""
 """Suite of rows of ``stage`` that make more steps."""
 COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
 """Captures that every method is compared on."""
@@ -208,14 +210,23 @@ def _body(page: str) -> str:
 def doubled(records: Records, longer: Records) -> str:
     """Cells that ran longer, behind the same of the table, over the seeds that both ran."""
     lines = [f"| method | steps | {' | '.join(COMPARED)} |", f"|---|---|{'---|' * len(COMPARED)}"]
-    shared = records.by_cell.keys() & longer.by_cell.keys()
-    pair = [replace(of, by_cell={k: of.by_cell[k] for k in shared}) for of in (records, longer)]
     for row in longer.plan.suite.rows:
-        steps = [of.figure(row.name, lambda r: r["iteration"], COMPARED) for of in pair]
+        name = row.name.removesuffix(TWICE_AGAIN)
+        before, after = (records if name == row.name else longer, name), (longer, row.name)
+        run = [
+            {(capture, seed) for capture, row_, seed in of.by_cell if row_ == named}
+            for of, named in (before, after)
+        ]
+        shared = run[0] & run[1]
+        pair = []
+        for of, named in (before, after):
+            keys = [(capture, named, seed) for capture, seed in sorted(shared)]
+            pair.append((replace(of, by_cell={key: of.by_cell[key] for key in keys}), named))
+        steps = [of.figure(named, lambda r: r["iteration"], COMPARED) for of, named in pair]
         if None in steps:
             continue
         lengths = " → ".join(f"{found.mean:,.0f}" for found in steps if found)
-        texts = [[trio(of, row.name, capture) for of in pair] for capture in COMPARED]
+        texts = [[trio(of, named, capture) for of, named in pair] for capture in COMPARED]
         figures = ["–" if "–" in both else " → ".join(both) for both in texts]
         title = title_of(longer, row, COMPARED)
         lines.append(f"| {title} | {lengths} | {' | '.join(figures)} |")
