@@ -120,6 +120,20 @@ def test_events_of_exponential_light_come_at_an_even_rate(lamp, tmp_path):
     assert (picture[..., 0] >= picture[..., 2]).all()
 
 
+@pytest.mark.parametrize(("event_hz", "slow"), [(60, 1), (110, 2), (75, 1), (10, 1)])
+def test_events_are_made_of_no_fewer_pictures_a_second_than_asked_for(
+    lamp, tmp_path, event_hz, slow
+):
+    """Of a whole number of them between two frames of the film, as few as that takes."""
+    render_run(
+        lamp.run, show="events", fps=25, slow=slow, event_hz=event_hz, out=tmp_path / "events"
+    )
+    steps_us = np.diff(sorted(set(lamp.lamp.drawn)))
+    frames_hz = 25 * slow
+    per_frame = next(count for count in range(1, 99) if count * frames_hz >= event_hz)
+    np.testing.assert_allclose(steps_us, 1e6 / (per_frame * frames_hz), atol=1)
+
+
 def test_beside_events_stand_the_recorded_ones(lamp, tmp_path):
     out = render_run(lamp.run, show="events", beside=True, fps=25, event_hz=50, out=tmp_path / "e")
     camera = lamp.capture.cameras["main"]
