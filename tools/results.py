@@ -212,16 +212,7 @@ def doubled(records: Records, longer: Records) -> str:
     lines = [f"| method | steps | {' | '.join(COMPARED)} |", f"|---|---|{'---|' * len(COMPARED)}"]
     for row in longer.plan.suite.rows:
         name = row.name.removesuffix(TWICE_AGAIN)
-        before, after = (records if name == row.name else longer, name), (longer, row.name)
-        run = [
-            {(capture, seed) for capture, row_, seed in of.by_cell if row_ == named}
-            for of, named in (before, after)
-        ]
-        shared = run[0] & run[1]
-        pair = []
-        for of, named in (before, after):
-            keys = [(capture, named, seed) for capture, seed in sorted(shared)]
-            pair.append((replace(of, by_cell={key: of.by_cell[key] for key in keys}), named))
+        pair = _both_ran((records if name == row.name else longer, name), (longer, row.name))
         steps = [of.figure(named, lambda r: r["iteration"], COMPARED) for of, named in pair]
         if None in steps:
             continue
@@ -231,6 +222,16 @@ def doubled(records: Records, longer: Records) -> str:
         title = title_of(longer, row, COMPARED)
         lines.append(f"| {title} | {lengths} | {' | '.join(figures)} |")
     return "\n".join(lines)
+
+
+def _both_ran(*rows: tuple[Records, str]) -> list[tuple[Records, str]]:
+    """Rows of records, by the captures and seeds alone that all of them ran on."""
+    run = [{(key[0], key[2]) for key in of.by_cell if key[1] == name} for of, name in rows]
+    shared = sorted(set.intersection(*run))
+    return [
+        (replace(of, by_cell={(c, name, s): of.by_cell[c, name, s] for c, s in shared}), name)
+        for of, name in rows
+    ]
 
 
 def psnr_of(record: Record) -> str:
