@@ -108,6 +108,31 @@ def test_a_part_of_a_davis_recording_begins_with_its_first_frame(
     assert capture.transfer("000004") == "power"
 
 
+@pytest.mark.parametrize("second", [False, True])
+def test_a_davis_whose_clock_was_set_is_read_up_to_there_or_from_there(
+    davis: Path, tmp_path: Path, second: bool
+) -> None:
+    path, back_us = tmp_path / "reset.aedat4", 5_000_000
+    events, frames = some_events(EPOCH_US), some_frames(EPOCH_US)
+    count = len(events)
+    both = EventStream(
+        np.concatenate([events.t, events.t - back_us]),
+        *(np.concatenate([column] * 2) for column in (events.x, events.y, events.p)),
+    )
+    later = [(picture, start - back_us, end - back_us) for picture, start, end in frames]
+    path.write_bytes(aedat4(both, WIDTH, HEIGHT, frames + later))
+    with pytest.raises(DataError, match=f"--stop {count}' keeps .* 'evsplat import davis', with"):
+        import_capture("davis", path, tmp_path / "out")
+    part = {"skip": count, "frames": (COUNT, 2 * COUNT)} if second else {"stop": count}
+    part = {"frames": (0, COUNT), **part}
+    capture = run("davis", path, tmp_path / "out", **part)
+    whole = run("davis", davis, tmp_path / "whole", frames=(0, COUNT))
+    assert [f.exposure_us for f in capture.frames] == [f.exposure_us for f in whole.frames]
+    assert capture.events is not None and whole.events is not None
+    one, other = (c.events.between(-(1 << 40), 1 << 40) for c in (capture, whole))
+    assert np.array_equal(one.t, other.t) and np.array_equal(one.x, other.x)
+
+
 def test_aedat3_makes_the_capture_that_aedat4_makes(davis: Path, tmp_path: Path) -> None:
     # the clock of 31 bits begins again within an exposure
     begin_us = (1 << 31) - 3_000 - 2 * PERIOD_US - EXPOSURE_US // 2

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from tqdm import tqdm
@@ -30,8 +31,9 @@ from evsplat.importers.recorded import (
     shrunk_camera,
     write_recorded_events,
 )
-from evsplat.options.declare import Flag
+from evsplat.options.declare import Flag, option
 from evsplat.pictures.light import Transfer
+from evsplat.ranges import AtLeast
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +54,21 @@ class Davis(Importer):
     """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
+    skip: Annotated[int, AtLeast(0), option("N")] = 0
+    """Leave out so many events at the beginning of the file, as of another recording in it."""
+    stop: Annotated[int | None, AtLeast(1), option("N", default="the end")] = None
+    """Leave out event N of the file, counted from 0, and all after it."""
     repair: Flag = False
     """Read on where the recording is damaged."""
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read the recording; see `Importer.write`."""
-        recording = open_recording(need(source, "an AEDAT recording"), repair=self.repair)
+        recording = open_recording(
+            need(source, "an AEDAT recording"),
+            repair=self.repair,
+            skip=self.skip,
+            stop=self.stop,
+        )
         spans, shapes = [], []
         for index, frame in enumerate(recording.frames()):
             spans.append(_span(source, index, frame))

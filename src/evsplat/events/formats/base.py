@@ -188,7 +188,10 @@ class ByteReader(ExitStack):
 def parts_said(path: Path, event: int) -> str:
     """How the user takes the recording before an event of a file, or that from it on."""
     first = command("convert", path, "PART.h5", "--stop", str(event))
-    return f"'{first}' keeps the one before, --skip {event} the other"
+    said = f"'{first}' keeps the one before, --skip {event} the other"
+    if path.suffix.startswith(".aedat"):  # whose pictures convert leaves out
+        said += " (so does 'evsplat import davis', with --frames for its pictures)"
+    return said
 
 
 def two_recordings(path: Path, at: int, *, zipped: bool) -> DataError:
