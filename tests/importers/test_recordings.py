@@ -199,8 +199,10 @@ def test_a_davis_whose_events_have_a_clock_of_their_own_is_brought_onto_that_of_
 ) -> None:
     """Whichever way the offset comes, found or given, and wherever the clocks begin."""
     path = tmp_path / "dance.aedat4"
-    begin_us = EPOCH_US + int(np.random.default_rng().integers(1_000_000))
-    ahead_us = int(np.random.default_rng().integers(-5_000_000, 5_000_000))
+    rng = np.random.default_rng()
+    begin_us = EPOCH_US + int(rng.integers(1_000_000))
+    # by more than the recording is long, so that none is at the time of a picture
+    ahead_us = int(rng.choice([-1, 1]) * rng.integers(1_000_000, 5_000_000))
     frames = some_frames(begin_us)
     path.write_bytes(aedat4(events_of_the_bar(begin_us + ahead_us), WIDTH, HEIGHT, frames))
     with pytest.raises(DataError, match="give --clock-offset-us auto, which finds the offset.$"):
