@@ -33,6 +33,33 @@ def test_a_way_passes_through_its_cameras(count):
         torch.testing.assert_close(at.K, camera.K, atol=1e-4, rtol=0)
 
 
+def test_cameras_of_other_sizes_are_seen_in_the_first_ones_pixels():
+    camera = _camera(4)
+    path = through([0, 0.5, 1], [camera, camera.resized(192, 96), camera.resized(32, 240)])
+    for share in (0.0, 0.3, 0.5, 0.8, 1.0):
+        at = path(share)
+        assert (at.width, at.height) == (64, 48)
+        torch.testing.assert_close(at.K, camera.K, atol=1e-3, rtol=0)
+
+
+def test_two_cameras_have_a_straight_way_at_an_even_pace_and_several_a_smooth_one():
+    ends = [_camera(seed) for seed in range(2)]
+    path = through([0, 1], ends)
+    first, last = (camera.center() for camera in ends)
+    for share in (0.1, 0.25, 0.5, 0.9):
+        center = torch.lerp(first, last, share)
+        torch.testing.assert_close(path(share).center(), center, atol=1e-5, rtol=0)
+    # Neither stands still at its ends nor turns a corner in the middle.
+    shares = [0, 0.3, 1]
+    path = through(shares, [_camera(seed) for seed in range(3)])
+    step = 1e-2
+    at = lambda share: path(share).center().double()  # noqa: E731
+    for end, inward in ((0.0, step), (1.0, -step)):
+        assert (at(end + inward) - at(end)).norm() > 0.5 * step
+    before, after = at(0.3) - at(0.3 - step), at(0.3 + step) - at(0.3)
+    assert (after - before).norm() < 0.2 * before.norm()
+
+
 def _document() -> dict:
     return {
         "format": "evsplat-camera-path",
