@@ -118,3 +118,13 @@ def test_tensors_of_other_gaussians_are_refused():
     assert isinstance(Seen.of(tensors, 3), Seen)
     with pytest.raises(ValueError, match="of 4 Gaussians"):
         Seen.of(tensors, 4)
+
+
+@pytest.mark.parametrize("name", ["weight", "squares", "directions"])
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
+def test_one_number_that_is_none_is_refused_wherever_it_stands(name, wrong):
+    tensors = dict(vars(Seen(torch.ones(3), torch.ones(3), torch.ones(3, 3))))
+    tensors[name] = tensors[name].clone()
+    tensors[name][2] = wrong
+    with pytest.raises(ValueError, match="not finite"):
+        Seen.of(tensors, 3)
