@@ -120,10 +120,25 @@ def test_polarities_are_exchanged_where_there_are_any(
     assert not (tmp_path / "x.h5").exists()
 
 
-def test_a_recording_is_not_converted_onto_itself(tmp_path: Path) -> None:
-    write_events(tmp_path / "e.npz", random_stream(6, 10))
-    with pytest.raises(ConfigError, match="is the recording itself"):
-        convert_recording(tmp_path / "e.npz", tmp_path / "e.npz")
+def test_a_recording_is_not_converted_onto_itself_unless_that_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    s = random_stream(int(np.random.default_rng().integers(1_000)), 3_000)
+    for name in ("e.npz", "e.h5", "e.csv", "e.raw"):
+        path = tmp_path / name
+        write_events(path, s)
+        with pytest.raises(ConfigError, match="is the recording itself.* by --in-place"):
+            convert_recording(path, path)
+        assert main(["convert", str(path), "--in-place", "--invert"]) == 0
+        assert same(read_events(path), EventStream(s.t, s.x, s.y, -s.p))
+        before = path.read_bytes()
+        for wrong in ([], [str(tmp_path / "out.h5"), "--in-place"]):
+            assert main(["convert", str(path), *wrong]) == 2
+            assert "give OUT, the file to write, or --in-place" in capsys.readouterr().err
+        # stopped on the way, it stays as it was
+        assert main(["convert", str(path), "--in-place", "--to", "evt2", "--width", "9"]) == 2
+        assert path.read_bytes() == before
+    assert sorted(one.suffix for one in tmp_path.iterdir()) == [".csv", ".h5", ".npz", ".raw"]
 
 
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:

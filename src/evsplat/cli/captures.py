@@ -33,8 +33,10 @@ class Convert:
 
     recording: Annotated[Positional[Path], option("IN"), Input(check_file)]
     """AEDAT4, AEDAT2, RAW, DAT, HDF5, .npz, text, .es or a ROS bag."""
-    out: Annotated[Positional[Path], option("OUT")]
+    out: Annotated[Positional[Path | None], option("OUT", default="")] = None
     """The file to write."""
+    in_place: Flag = False
+    """Replace IN, instead of OUT, once all is written."""
     from_zero: Flag = False
     """Let the first event be at 0."""
     to: Annotated[
@@ -52,6 +54,8 @@ class Convert:
     def __call__(self) -> None:
         from evsplat.events.convert import convert_recording
 
+        if self.in_place == (self.out is not None):
+            raise ConfigError("convert: give OUT, the file to write, or --in-place to replace IN.")
         conversion = convert_recording(
             self.recording,
             self.out,

@@ -41,7 +41,7 @@ class Conversion:
 
 def convert_recording(
     source: Path | str,
-    out: Path | str,
+    out: Path | str | None,
     options: ReadOptions | None = None,
     *,
     from_zero: bool = False,
@@ -55,7 +55,8 @@ def convert_recording(
 
     Args:
         source: The recording to read.
-        out: The file to write; the suffix chooses the format as in `write_events`.
+        out: The file to write; the suffix chooses the format as in `write_events`. None writes to
+            ``source``, which stays as it was until all is written.
         options: The caller's statements about the source.
         from_zero: Let the first event be at 0.
         to: Format to write, whatever the suffix.
@@ -65,10 +66,13 @@ def convert_recording(
         invert: Exchange the polarities, of a driver that has darker for brighter.
         changes: Fields of ``options``, such as ``repair``, or the source's ``format``.
     """
-    source, out = Path(source), Path(out)
+    source, in_place = Path(source), out is None
+    out = source if out is None else Path(out)
     mover = _mover(homography, size)
-    if out.exists() and source.exists() and out.samefile(source):
-        raise ConfigError(f"{out}: is the recording itself; write to another file.")
+    if not in_place and out.exists() and source.exists() and out.samefile(source):
+        raise ConfigError(
+            f"{out}: is the recording itself; write to another file, or replace it by --in-place."
+        )
     recording = open_recording(source, options, **changes)
     if invert and not recording.has_polarity:
         raise ConfigError(f"--invert: {source} has no polarity to exchange; leave it out.")

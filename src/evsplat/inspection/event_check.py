@@ -1,7 +1,6 @@
 """Warnings about events that do not tell what frames show: turned, inverted, sparse, lost."""
 
 import logging
-import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,9 +129,7 @@ def _way_there(
         options += ["--homography", str(homography), "--size", *map(str, found.size_px)]
     if isinstance(found, Disagreement) and found.inverted:
         options.append("--invert")
-    new = events.path.with_name("moved.h5")
-    convert = command("convert", events.path, new, *options)
-    return f"bring them there: {convert} && {shlex.join(['mv', str(new), str(events.path)])}"
+    return f"bring them there: {command('convert', events.path, '--in-place', *options)}"
 
 
 def _tell_lost(findings: Findings, events: EventStore, lost: Lost) -> None:
