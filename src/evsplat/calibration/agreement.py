@@ -4,13 +4,14 @@ A beam splitter mirrors one of two cameras, drivers turn pictures and not events
 polarity the other way round. Such a recording is whole and valid, and teaches the opposite.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evsplat.calibration.brightness import EventSource, FramePair
 from evsplat.calibration.clock import SEARCH_US, correlations_at
+from evsplat.calibration.ways import WAYS, Way, in_words, turned, way_homography, ways_of
 from evsplat.events.homography import Homography
 
 SURE = 0.5
@@ -19,20 +20,6 @@ recordings and staged captures, and mirrored at less than 0.25."""
 LEAD = 0.5
 """Another way has to be better by so much of what the given one lacks to a correlation of 1. Motion
 that swings to and fro fits with the other sign as well, half a swing later, but less."""
-
-# What turns the frames onto the events, by what would turn the events onto the frames.
-_WAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "": lambda a: a,
-    "mirrored left to right": lambda a: a[:, ::-1],
-    "mirrored top to bottom": lambda a: a[::-1],
-    "turned by 180 degrees": lambda a: a[::-1, ::-1],
-}
-_SQUARE_WAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "mirrored with x and y exchanged": lambda a: a.T,
-    "turned by 90 degrees to the right": lambda a: np.rot90(a),
-    "turned by 90 degrees to the left": lambda a: np.rot90(a, -1),
-    "turned by 180 degrees with x and y exchanged": lambda a: a[::-1, ::-1].T,
-}
 
 
 @dataclass(frozen=True)
@@ -53,18 +40,12 @@ class Disagreement:
     @property
     def homography(self) -> Homography:
         """(3, 3), by which `evsplat.events.moved` brings events into the pixels of the frames."""
-        width, height = self.size_px
-        way = (_WAYS | _SQUARE_WAYS)[self.turned]
-        # columns and rows of the frames, where the events have theirs
-        axes = [way(numbers) for numbers in np.meshgrid(np.arange(width), np.arange(height))]
-        rows = [[one[0, 1] - one[0, 0], one[1, 0] - one[0, 0], one[0, 0]] for one in axes]
-        return np.array([*rows, [0, 0, 1]], np.float64)
+        return way_homography(WAYS[self.turned], self.size_px)
 
     def __str__(self) -> str:
-        ways = [self.turned] if self.turned else []
-        ways += ["of the other polarity"] if self.inverted else []
+        words = in_words(self.turned, inverted=self.inverted)
         return (
-            f"events that fit the frames only if they were {' and '.join(ways)} (correlation "
+            f"events that fit the frames only if they were {words} (correlation "
             f"{self.correlation:.2f}, as they are {self.as_given:.2f})"
         )
 
@@ -79,21 +60,22 @@ def estimate_disagreement(pairs: Sequence[FramePair], events: EventSource) -> Di
     step = max(500.0, float(np.median([pair.gap_us for pair in pairs])) / 4)
     lags = np.arange(-round(SEARCH_US / step), round(SEARCH_US / step) + 1) * step
 
-    def found(turned: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
+    def found(way: Way) -> tuple[float, float]:
         """The largest correlation, and the largest of the other sign; 0 where there is none."""
         views = [
-            replace(pair, change=turned(pair.change), usable=turned(pair.usable)) for pair in pairs
+            replace(pair, change=turned(pair.change, way), usable=turned(pair.usable, way))
+            for pair in pairs
         ]
         at = np.nan_to_num(correlations_at(views, events, lags))
         return max(0.0, float(at.max())), max(0.0, float(-at.min()))
 
-    as_given, inverse = found(_WAYS[""])
+    as_given, inverse = found(WAYS[""])
     if as_given >= SURE and inverse <= _needed(as_given):
         return None
     height, width = pairs[0].change.shape
     size = width, height
     best = Disagreement("", True, inverse, as_given, size)
-    for name, way in (_WAYS | (_SQUARE_WAYS if height == width else {})).items():
+    for name, way in ways_of(size).items():
         for inverted, correlation in enumerate(found(way) if name else ()):
             if correlation > best.correlation:
                 best = Disagreement(name, bool(inverted), correlation, as_given, size)

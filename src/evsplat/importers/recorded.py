@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -12,13 +12,14 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from evsplat.calibration.offset import LEAST_CORRELATION, BlockChanges, TooLong, estimate_offset
+from evsplat.calibration.ways import in_words, way_homography, ways_of
 from evsplat.capture.camera_file import read_camera
 from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
-from evsplat.events.homography import Mover
+from evsplat.events.homography import Mover, moved
 from evsplat.footage import Footage, TimedPicture
 from evsplat.importers.base import check_positive, need, shrunk, shrunk_view
 from evsplat.pictures.files import to_unit_range
@@ -288,23 +289,11 @@ def _refuse_turned(
 ) -> None:
     """Raise where events that were mirrored or inverted would have an offset that is certain."""
     found = []
-    for mirror_x, mirror_y, inverted in product((False, True), repeat=3):
-        turned = (
-            EventStream(
-                piece.t,
-                (size[0] - 1 - piece.x).astype(np.uint16) if mirror_x else piece.x,
-                (size[1] - 1 - piece.y).astype(np.uint16) if mirror_y else piece.y,
-                -piece.p if inverted else piece.p,
-            )
-            for piece in pieces()
-        )
-        ways = {
-            "mirrored left to right": mirror_x and not mirror_y,
-            "mirrored top to bottom": mirror_y and not mirror_x,
-            "turned by 180 degrees": mirror_x and mirror_y,
-            "of the other polarity": inverted,
-        }
-        words = " and ".join(way for way, taken in ways.items() if taken)
+    for (name, way), inverted in product(ways_of(size).items(), (False, True)):
+        turned = moved(pieces(), way_homography(way, size), *size)
+        if inverted:
+            turned = (replace(piece, p=-piece.p) for piece in turned)
+        words = in_words(name, inverted=inverted)
         offset = estimate_offset(levels, turned, size) if words else None
         if offset is not None and offset.is_certain:
             found.append((offset.correlation, words, offset.offset_us))
