@@ -1,70 +1,20 @@
 """Events that lie beside the pixels of the frames, by known ways, are told as they were moved."""
 
-import functools
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from scipy.ndimage import gaussian_filter, map_coordinates
 
-from evsplat.calibration import FramePair, estimate_placement, exposure, pair
+from evsplat.calibration import FramePair, estimate_placement
 from evsplat.events import EventStream
 from evsplat.events import moved as moved_by
 
-WIDTH, HEIGHT, FRAMES = 96, 80, 9
-PERIOD_US, STEP_US, EXPOSURE_US = 40_000, 2_000, 8_000
+from .film import FRAMES, HEIGHT, PERIOD_US, WIDTH, filmed_swing
 
 
-@functools.cache
 def filmed(seed: int) -> tuple[list[FramePair], EventStream]:
-    """Something with a pattern that goes and turns before a wall with one, by ideal pixels.
-
-    It swings: of what goes evenly a shift along its way is as if it came later.
-    """
-    rng = np.random.default_rng(seed)
-    wall, coat = (gaussian_filter(rng.standard_normal((HEIGHT, WIDTH)), 2.5) * 5 for _ in range(2))
-    way, turn = rng.uniform(-7, 7, 2), rng.uniform(-0.2, 0.2)
-    begin = rng.uniform(0, 2 * np.pi)
-    grid = np.stack(np.mgrid[:HEIGHT, :WIDTH]).astype(float) - np.array(
-        [[[HEIGHT / 2]], [[WIDTH / 2]]]
-    )
-
-    def level(time_us: float) -> np.ndarray:
-        swing = np.sin(begin + 8 * time_us / (FRAMES * PERIOD_US))
-        angle = turn * swing
-        y, x = grid - (swing * way)[:, None, None]
-        rows = np.cos(angle) * y - np.sin(angle) * x
-        columns = np.sin(angle) * y + np.cos(angle) * x
-        inside = 1 / (1 + np.exp(np.maximum((np.hypot(rows / 26, columns / 16) - 1) * 20, -50)))
-        pattern = map_coordinates(
-            coat, [rows + HEIGHT / 2, columns + WIDTH / 2], order=1, mode="mirror"
-        )
-        return -1.6 + (1 - inside) * wall * 0.5 + inside * (pattern + 0.3)
-
-    reference = level(0) + rng.uniform(-0.2, 0.2, (HEIGHT, WIDTH))
-    events = []
-    for time in range(0, FRAMES * PERIOD_US, STEP_US):
-        now = level(time)
-        for sign in (1, -1):
-            while (passed := sign * (now - reference) >= 0.2).any():
-                y, x = np.nonzero(passed)
-                events.append((np.full(len(x), time), x, y, np.full(len(x), sign)))
-                reference[passed] += sign * 0.2
-    t, x, y, p = (np.concatenate(column) for column in zip(*events, strict=True))
-    stream = EventStream(t, x.astype(np.uint16), y.astype(np.uint16), p.astype(np.int8))
-    spans = [(k * PERIOD_US, k * PERIOD_US + EXPOSURE_US) for k in range(FRAMES)]
-    seen = [
-        exposure(
-            torch.from_numpy(
-                np.mean([np.exp(level(u)) for u in np.linspace(*span, 5)], axis=0) ** (1 / 2.2)
-            ),
-            span,
-        )
-        for span in spans
-    ]
-    recorded = -(10**9), 10**9
-    return [pair(a, b, recorded) for a, b in zip(seen, seen[1:], strict=False)], stream
+    film = filmed_swing(seed)
+    return film.pairs, film.events
 
 
 def moved(

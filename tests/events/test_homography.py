@@ -199,6 +199,7 @@ def test_the_size_belongs_to_the_homography(
     homography = ["--homography", str(tmp_path / "H.txt")]
     for options, said in (
         (homography, "give --size WIDTH HEIGHT"),
+        (["--homography", "auto"], "is found by pictures, of which convert has none"),
         (["--size", "320", "240"], "--size: belongs to --homography"),
         ([*homography, "--size", "0", "240"], "--size 0 240: expected pixels from 1 to 65536"),
     ):

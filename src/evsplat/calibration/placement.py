@@ -6,16 +6,16 @@ best one it is fitted how they are turned and scaled. Nothing but the pictures i
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.ndimage import affine_transform
 
 from evsplat.calibration.brightness import EventSource, FramePair
+from evsplat.calibration.change_maps import Map, blurred, change_map, told_maps
 from evsplat.calibration.clock import SEARCH_US
 from evsplat.events.homography import Homography
-from evsplat.events.maps import event_pixels
 from evsplat.pictures.squares import square_means
 from evsplat.spread import evenly_spread
 
@@ -26,16 +26,12 @@ LEAST_GAIN = 0.03
 LEAST_PX = 0.6
 """Pixels of the maps by which half of what moves is displaced, or more."""
 _MOST_PAIRS = 16
-_MOST_EVENTS = 200_000
-"""About a pair; of more a part is taken."""
 _SIDE = 160
 """Larger pictures are compared as means over squares, on maps no longer than this."""
 _REACH = 0.2
 """Shifts up to this share of the map's shorter side are tried."""
 _STEPS = 4
 """Lags that are tried, to the time between two frames; every other one at first."""
-_LARGEST_CHANGE, _MOST_THRESHOLDS = 1.5, 6.0
-"""What counts of a pixel at most: few that change most would decide alone."""
 _BLURS = (2.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.0)
 """Standard deviation in pixels for each step of the fit; the last is that of correlations told."""
 _STEPS_OF_HALVES = 3
@@ -45,7 +41,6 @@ _FARTHEST = 0.15
 _AGREEING_PX = 1.0
 """Halves of the recording agree so well on where what moves belongs."""
 
-Map = Float32[np.ndarray, "P h w"]
 Affine = Float[np.ndarray, "4"]
 """Scale times cosine less 1, scale times sine, and shift right and down: from the frames' pixels to
 the events', about the middle of the picture."""
@@ -117,11 +112,12 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
         return None
     height, width = chosen[0].change.shape
     step = math.ceil(max(height, width) / _SIDE)
-    frames = square_means(np.stack([_change(pair) for pair in chosen]), step)
+    frames = square_means(np.stack([change_map(pair) for pair in chosen]), step)
     gap_us = float(np.median([pair.gap_us for pair in chosen]))
     most = 1 + math.ceil(max(SEARCH_US / gap_us, 1) * _STEPS)
     lags = np.arange(-most, most + 1) * gap_us / _STEPS
-    told = np.stack([_told(pair, events, lags, step) for pair in chosen], axis=1)
+    size = width, height
+    told = np.stack([told_maps(pair, events, lags, size, step) for pair in chosen], axis=1)
     if not frames.any() or not told.any():
         return None
     coarse = range(1, len(lags), 2)
@@ -156,34 +152,10 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
         scale,
         best,
         max(given, 0.0),
-        (width, height),
+        size,
         # of the maps, whose squares leave out what remains at the right and below
         ((width // step * step - 1) / 2, (height // step * step - 1) / 2),
     )
-
-
-def _change(pair: FramePair) -> Float32[np.ndarray, "H W"]:
-    change = np.where(pair.usable, pair.change - pair.camera_change, 0.0)
-    return np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE).astype(np.float32)
-
-
-def _told(
-    pair: FramePair, events: EventSource, lags: Float[np.ndarray, "L"], step: int
-) -> Float32[np.ndarray, "L h w"]:
-    """Sums of polarities at each lag, of what may be read, as means over squares of pixels."""
-    (start, end), (low, high) = pair.span_us, pair.recorded_us
-    first = max(start + math.floor(lags[0]), low)
-    near = events.between(first, max(first, min(end + math.ceil(lags[-1]), high)))
-    near = near.take(slice(None, None, max(1, len(near) // _MOST_EVENTS)))
-    height, width = (side // step for side in pair.change.shape)
-    small = replace(near, x=near.x // step, y=near.y // step)
-    small = small.take((small.x < width) & (small.y < height))
-    pixel = event_pixels(small, height, width)
-    maps = np.empty((len(lags), height, width), np.float32)
-    for one, lag in zip(maps, lags, strict=True):
-        weights = pair.weights(small.t - lag) * small.p
-        one[:] = np.bincount(pixel, weights, height * width).reshape(height, width) / step**2
-    return np.clip(maps, -_MOST_THRESHOLDS, _MOST_THRESHOLDS)
 
 
 def _flipped(maps: np.ndarray, flips: tuple[int, int]) -> np.ndarray:
@@ -227,8 +199,8 @@ def _fitted(frames: Map, told: Map, start: Affine, blurs: Sequence[float]) -> Af
     y, x = np.mgrid[:height, :width].astype(np.float64)
     x, y = x - (width - 1) / 2, y - (height - 1) / 2
     for blur in blurs:
-        target = _blurred(frames, blur)
-        seen = _laid(_blurred(told, blur), affine)
+        target = blurred(frames, blur)
+        seen = _laid(blurred(told, blur), affine)
         down, right = np.gradient(seen, axis=(1, 2))
         columns = [target, -(right * x + down * y), -(down * x - right * y), -right, -down]
         design = np.stack([column.ravel() for column in columns], axis=1)
@@ -236,10 +208,6 @@ def _fitted(frames: Map, told: Map, start: Affine, blurs: Sequence[float]) -> Af
         affine = affine + found[1:]
         affine[:2] = np.clip(affine[:2], -_FARTHEST, _FARTHEST)
     return affine
-
-
-def _blurred(maps: Map, sigma: float) -> Map:
-    return gaussian_filter(maps, (0, sigma, sigma), mode="constant")
 
 
 def _laid(told: Map, affine: Affine) -> Map:
@@ -253,8 +221,8 @@ def _laid(told: Map, affine: Affine) -> Map:
 
 
 def _correlation(frames: Map, told: Map, affine: Affine) -> float:
-    one = _blurred(frames, _BLURS[-1])
-    other = _laid(_blurred(told, _BLURS[-1]), affine)
+    one = blurred(frames, _BLURS[-1])
+    other = _laid(blurred(told, _BLURS[-1]), affine)
     size = math.sqrt(float(np.square(one).sum()) * float(np.square(other).sum()))
     return float((one * other).sum()) / size if size > 0 else 0.0
 

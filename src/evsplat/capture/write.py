@@ -20,6 +20,7 @@ from evsplat.capture.points import write_points
 from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
+from evsplat.events.homography import Homography, write_homography
 from evsplat.files import (
     copy_file,
     make_folder,
@@ -303,6 +304,15 @@ class CaptureWriter:
             "clock_offset_us": int(clock_offset_us),
         }
         return count
+
+    def add_homography(
+        self, file: str, homography: Homography, size: tuple[int, int], certainty: dict[str, Any]
+    ) -> None:
+        """Keep by what events were brought into pictures of ``size``, as recorded, and how certain
+        it is: in ``file``, and as ``provenance.homography``.
+        """
+        write_homography(self._root / file, homography, size)
+        self.provenance["homography"] = {"matrix": _numbers(homography), "file": file, **certainty}
 
     @property
     def exposed_us(self) -> tuple[int, int]:

@@ -95,13 +95,18 @@ def _mover(homography: Path | None, size: tuple[int, int] | None) -> Mover | Non
                 "--size: belongs to --homography; that of the sensor is --width and --height."
             )
         return None
+    if str(homography) == "auto":
+        raise ConfigError(
+            "--homography auto: is found by pictures, of which convert has none; import both with "
+            "'evsplat import folder' or 'evsplat import video', or give a file."
+        )
     if size is None:
         raise ConfigError(
             "--homography: moves events into pixels of pictures; give --size WIDTH HEIGHT, theirs."
         )
     if not all(1 <= side <= 1 << 16 for side in size):
         raise ConfigError(f"--size {size[0]} {size[1]}: expected pixels from 1 to 65536.")
-    return Mover(Path(homography), size)
+    return Mover.read(Path(homography), size)
 
 
 def _watched(

@@ -104,13 +104,18 @@ def write_homography(path: Path, homography: Homography, size: tuple[int, int]) 
 
 
 class Mover:
-    """Moves events by the homography of a file, and knows how many of a pass fell outside."""
+    """Moves events by a homography, and knows how many of a pass fell outside."""
 
-    def __init__(self, file: Path, size: tuple[int, int]) -> None:
-        """Read the file; ``size`` is the width and height of the pictures."""
+    def __init__(self, file: Path, homography: Homography, size: tuple[int, int]) -> None:
+        """``file`` is what holds it, ``size`` the width and height of the pictures."""
         self._file, self._size = file, size
-        self._homography = read_homography(file)
+        self._homography = homography
         self._events = self._inside = 0
+
+    @classmethod
+    def read(cls, file: Path, size: tuple[int, int]) -> "Mover":
+        """By the homography in a file (`read_homography`)."""
+        return cls(file, read_homography(file), size)
 
     def moved(self, pieces: Iterable[EventStream], path: Path) -> Iterator[EventStream]:
         """The pieces of the recording ``path`` as of `moved`, counted anew.

@@ -15,6 +15,7 @@ from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
 from evsplat.footage import TimedPicture
 from evsplat.importers.base import Importer, chosen_frames, need
+from evsplat.importers.clock_offset import offset_or_levels
 from evsplat.importers.option_types import (
     ClockOffset,
     Contrast,
@@ -26,7 +27,6 @@ from evsplat.importers.option_types import (
 from evsplat.importers.recorded import (
     add_recorded_frame,
     large_pictures,
-    offset_or_levels,
     recorded_camera,
     shrunk_camera,
     write_recorded_events,

@@ -11,7 +11,6 @@ from evsplat.body.pose_errors import PoseSource
 from evsplat.body.pose_files import PoseSequence
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.events.homography import Mover
 from evsplat.footage import Footage, TimedPicture, open_footage
 from evsplat.importers.base import (
     GUIDE,
@@ -23,6 +22,7 @@ from evsplat.importers.base import (
     need,
     short_exposure,
 )
+from evsplat.importers.clock_offset import offset_or_levels
 from evsplat.importers.exposures import read_exposures
 from evsplat.importers.option_types import (
     ClockOffset,
@@ -32,17 +32,18 @@ from evsplat.importers.option_types import (
     FileOption,
     Focal,
     FrameRange,
+    HomographyOption,
     Name,
     OwnRate,
     Shrink,
     TimeUs,
 )
+from evsplat.importers.place_finder import given_mover, place_finder
 from evsplat.importers.poses import Motion, add_motion, frames_with_poses, read_motion
 from evsplat.importers.recorded import (
     add_recorded_events,
     add_recorded_frame,
     large_pictures,
-    offset_or_levels,
     pictures_of,
     recorded_camera,
     shrunk_camera,
@@ -66,9 +67,9 @@ class Folder(Importer):
     """Folder of pictures, or a video; by default SOURCE/images or the video in SOURCE."""
     events: FileOption = None
     """Event recording of any known format; by default SOURCE/events.* if there is one."""
-    homography: FileOption = None
+    homography: HomographyOption = None
     """From the events' pixels to those of the pictures as recorded: 3 lines of 3 numbers, or .npy;
-    by default events are there already."""
+    auto finds it by what moves; by default events are there already."""
     poses: FileOption = None
     """Poses of any known tool, or body.npz; by default poses.*, poses/ or body.npz in SOURCE;
     without any there is no body."""
@@ -103,7 +104,7 @@ class Folder(Importer):
         middles = exposures.sum(axis=1) // 2
         path = self._poses(source)
         size = footage.width, footage.height
-        mover = None if self.homography is None else Mover(self.homography, size)
+        mover = given_mover(self.homography, size)
         motion: Motion | None = None
         if path is not None:
             motion = read_motion(path, self.person, self.pose_source, size, smpl)
@@ -117,12 +118,15 @@ class Folder(Importer):
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
         clock_offset = offset_or_levels(self.clock_offset_us, camera)
+        spans = {index: (int(exposures[index, 0]), int(exposures[index, 1])) for index in seen}
+        finder = place_finder(self.homography, list(spans.values()), camera)
         for index, timed in pictures_of(footage, seen):
-            exposure = int(exposures[index, 0]), int(exposures[index, 1])
+            if finder is not None:
+                finder.add(timed, spans[index])
             add_recorded_frame(
                 writer,
                 timed,
-                exposure,
+                spans[index],
                 clock_offset,
                 shrink=self.shrink,
                 mask=masks.of(timed),
@@ -135,7 +139,7 @@ class Folder(Importer):
             clock_offset,
             contrast=self.contrast,
             repair=self.repair,
-            mover=mover,
+            mover=mover or finder,
             exposed_only=self.frames is not None,
             shrink=self.shrink,
         )

@@ -8,6 +8,8 @@ from evsplat.pictures.light import Transfer
 
 FileOption = Annotated[Path | None, option("PATH", default="")]
 """A part of a recording, whose help says where it is looked for."""
+HomographyOption = Annotated[Literal["auto"] | Path | None, option("FILE|auto", default="")]
+"""Of a file, or to be found (`evsplat.importers.place_finder`)."""
 FrameRange = Annotated[tuple[int, int] | None, option("FIRST STOP", default="")]
 Shrink = Annotated[int, option("N")]
 Rate = Annotated[float, option("HZ")]

@@ -2,26 +2,26 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from evsplat.calibration.offset import LEAST_CORRELATION, BlockChanges, TooLong, estimate_offset
-from evsplat.calibration.ways import in_words, way_homography, ways_of
+from evsplat.calibration.offset import BlockChanges
 from evsplat.capture.camera_file import read_camera
 from evsplat.capture.write import CaptureWriter
 from evsplat.commands import command
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
-from evsplat.events.homography import Mover, moved
+from evsplat.events.homography import Mover
 from evsplat.footage import Footage, TimedPicture
 from evsplat.importers.base import check_positive, need, shrunk, shrunk_view
+from evsplat.importers.clock_offset import found_offset
+from evsplat.importers.place_finder import PlaceFinder
 from evsplat.pictures.files import to_unit_range
 
 GUESSED_FOV_DEG = 60.0
@@ -81,17 +81,6 @@ def large_pictures(size: tuple[int, int]) -> list[str]:
     ]
 
 
-def offset_or_levels(
-    clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
-) -> int | BlockChanges:
-    """The clock's offset; where it is to be found, what is to be gathered of the frames for it."""
-    if not isinstance(clock_offset_us, str):
-        return clock_offset_us
-    if clock_offset_us != "auto":
-        raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
-    return BlockChanges(camera.get("transfer", "power"))
-
-
 def pictures_of(footage: Footage, wanted: Sequence[int]) -> Iterator[tuple[int, TimedPicture]]:
     """Number and picture of those that are ``wanted``, ascending; none after them is decoded."""
     pictures = enumerate(footage)
@@ -136,7 +125,7 @@ def add_recorded_events(
     *,
     contrast: tuple[float, float] | None,
     repair: bool,
-    mover: Mover | None = None,
+    mover: Mover | PlaceFinder | None = None,
     exposed_only: bool = False,
     shrink: int = 1,
 ) -> list[str]:
@@ -144,8 +133,8 @@ def add_recorded_events(
 
     ``clock_offset`` is in us, or the levels of the frames by which it is found. ``exposed_only``
     leaves out events before the first exposure and after the last. ``size`` is that of the pictures
-    as recorded, in whose pixels the events are, or are brought by ``mover``; both are made smaller
-    by ``shrink``.
+    as recorded, in whose pixels the events are, or are brought by ``mover``, which may have to be
+    found; both are made smaller by ``shrink``.
     """
     if path is None:
         of_events = {
@@ -167,10 +156,12 @@ def add_recorded_events(
         raise ConfigError(
             f"{path}: its sensor has {sensor.width}x{sensor.height} pixels, the pictures have "
             f"{width}x{height}, and events have to lie in the pixels of the pictures; move them "
-            "there by --homography FILE (docs/own-capture.md, two sensors). If they do already, "
-            f"say so: {said}"
+            "there by --homography FILE, or auto to have it found (docs/own-capture.md, two "
+            f"sensors). If they do already, say so: {said}"
         )
-    recording = sensor
+    recording, told = sensor, list[str]()
+    if isinstance(mover, PlaceFinder):
+        mover, told = mover.mover(sensor, clock_offset, writer)
     if mover is None:
         recording = open_recording(path, width=size[0], height=size[1], repair=repair)
 
@@ -189,7 +180,7 @@ def add_recorded_events(
         one_file=False,
     )
     # Repairs are known once the events have been read.
-    return [*(recording.notes if mover is None else mover.notes(recording)), *notes]
+    return [*told, *(recording.notes if mover is None else mover.notes(recording)), *notes]
 
 
 def write_recorded_events(
@@ -211,7 +202,7 @@ def write_recorded_events(
     """
     passed, notes = _Passed(), []
     if isinstance(clock_offset, BlockChanges):
-        clock_offset, note = _found_offset(clock_offset, pieces, path, size, one_file=one_file)
+        clock_offset, note = found_offset(clock_offset, pieces, path, size, one_file=one_file)
         notes.append(note)
     start, end = (time - clock_offset for time in writer.exposed_us)
     shrunken = passed.watching(_shrunk_events(pieces(), size, shrink))
@@ -241,71 +232,6 @@ def _shrunk_events(
 def _shrunk_contrast(contrast: tuple[float, float], factor: int) -> tuple[float, float]:
     """Thresholds of squares of pixels: one pixel's event is a share of the mean's change."""
     return contrast[0] / factor**2, contrast[1] / factor**2
-
-
-def _found_offset(
-    levels: BlockChanges,
-    pieces: Callable[[], Iterable[EventStream]],
-    path: Path,
-    size: tuple[int, int],
-    *,
-    one_file: bool,
-) -> tuple[int, str]:
-    """The offset of the events' clock, us, and a note of it; raises where it is not certain."""
-    try:
-        found = estimate_offset(levels, pieces(), size)
-    except TooLong as error:
-        raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
-    give = "give --clock-offset-us US, or film more that moves"
-    if one_file:
-        give = "leave --clock-offset-us out, as a sensor has one clock for both; or " + give
-    if found is None or not found.is_certain:
-        _refuse_turned(levels, pieces, path, size)
-    if found is None or found.correlation < LEAST_CORRELATION:
-        best = "" if found is None else f" (correlation {found.correlation:.2f} at best)"
-        raise DataError(
-            f"{path}: its events agree with the changes of the pictures at no offset of the "
-            f"clocks{best}; {give}."
-        )
-    offset_us = 100 * round(found.offset_us / 100)
-    if not found.is_certain:
-        raise DataError(
-            f"{path}: its events agree with the changes of the pictures at {offset_us} us "
-            f"(correlation {found.correlation:.2f}) hardly better than elsewhere "
-            f"({found.rival:.2f}); {give}."
-        )
-    note = (
-        f"events: the offset of their clock is found, {offset_us} us (correlation "
-        f"{found.correlation:.2f}, elsewhere {found.rival:.2f} at most)"
-    )
-    return offset_us, note
-
-
-def _refuse_turned(
-    levels: BlockChanges,
-    pieces: Callable[[], Iterable[EventStream]],
-    path: Path,
-    size: tuple[int, int],
-) -> None:
-    """Raise where events that were mirrored or inverted would have an offset that is certain."""
-    found = []
-    for (name, way), inverted in product(ways_of(size).items(), (False, True)):
-        turned = moved(pieces(), way_homography(way, size), *size)
-        if inverted:
-            turned = (replace(piece, p=-piece.p) for piece in turned)
-        words = in_words(name, inverted=inverted)
-        offset = estimate_offset(levels, turned, size) if words else None
-        if offset is not None and offset.is_certain:
-            found.append((offset.correlation, words, offset.offset_us))
-    if found:
-        # of ways that fit alike, as those of a scene that is the same upside down, the plainest
-        correlation, words, offset_us = max(found, key=lambda one: round(one[0], 3))
-        raise DataError(
-            f"{path}: its events agree with the changes of the pictures only if they were {words} "
-            f"(correlation {correlation:.2f}, at an offset of {offset_us:.0f} us); write them anew "
-            "that way by 'evsplat convert --invert' or 'evsplat convert --homography' "
-            "(docs/event-formats.md), or the pictures."
-        )
 
 
 @dataclass

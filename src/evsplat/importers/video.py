@@ -5,7 +5,6 @@ from pathlib import Path
 
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError
-from evsplat.events.homography import Mover
 from evsplat.footage import open_footage
 from evsplat.importers.base import (
     Importer,
@@ -14,6 +13,7 @@ from evsplat.importers.base import (
     exposure_around,
     short_exposure,
 )
+from evsplat.importers.clock_offset import offset_or_levels
 from evsplat.importers.option_types import (
     ClockOffset,
     Contrast,
@@ -22,15 +22,16 @@ from evsplat.importers.option_types import (
     FileOption,
     Focal,
     FrameRange,
+    HomographyOption,
     OwnRate,
     Shrink,
     TimeUs,
 )
+from evsplat.importers.place_finder import given_mover, place_finder
 from evsplat.importers.recorded import (
     add_recorded_events,
     add_recorded_frame,
     large_pictures,
-    offset_or_levels,
     pictures_of,
     recorded_camera,
     shrunk_camera,
@@ -48,9 +49,9 @@ class Video(Importer):
     """Make pictures and events smaller by this factor."""
     events: FileOption = None
     """Event recording of any known format, in the pixels of the video or brought there."""
-    homography: FileOption = None
+    homography: HomographyOption = None
     """From the events' pixels to those of the pictures as recorded: 3 lines of 3 numbers, or .npy;
-    by default events are there already."""
+    auto finds it by what moves; by default events are there already."""
     exposure_us: Exposure = None
     """Exposure time, microseconds; it has to be known."""
     fps: OwnRate = None
@@ -80,7 +81,7 @@ class Video(Importer):
             )
         check_positive(exposure_us=self.exposure_us)
         size = footage.width, footage.height
-        mover = None if self.homography is None else Mover(self.homography, size)
+        mover = given_mover(self.homography, size)
         camera, focal, note = recorded_camera(self.camera, self.focal, size)
         if self.transfer is not None:
             camera["transfer"] = self.transfer
@@ -88,10 +89,13 @@ class Video(Importer):
         writer.add_camera("main", *small, **camera)
         clock_offset = offset_or_levels(self.clock_offset_us, camera)
         kept = chosen_frames(self.frames, list(range(len(footage.times_us))), source)
-        for _, timed in pictures_of(footage, kept):
-            middle = timed.time_us + self.start_us
-            exposure = exposure_around(middle, self.exposure_us)
-            add_recorded_frame(writer, timed, exposure, clock_offset, shrink=self.shrink)
+        middles = (footage.times_us + self.start_us).tolist()
+        spans = {index: exposure_around(middles[index], self.exposure_us) for index in kept}
+        finder = place_finder(self.homography, list(spans.values()), camera)
+        for index, timed in pictures_of(footage, kept):
+            if finder is not None:
+                finder.add(timed, spans[index])
+            add_recorded_frame(writer, timed, spans[index], clock_offset, shrink=self.shrink)
         notes = add_recorded_events(
             writer,
             self.events,
@@ -99,7 +103,7 @@ class Video(Importer):
             clock_offset,
             contrast=self.contrast,
             repair=self.repair,
-            mover=mover,
+            mover=mover or finder,
             exposed_only=self.frames is not None,
             shrink=self.shrink,
         )

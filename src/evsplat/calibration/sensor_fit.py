@@ -1,0 +1,222 @@
+"""A similarity or a homography between pictures and another sensor's events, from a rough guess.
+
+Least squares of what events lack to be what frames change by, step by step (Lucas and Kanade), of
+the place and of the lag of the events' clock together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.ndimage import map_coordinates
+
+from evsplat.calibration.brightness import EventSource, FramePair
+from evsplat.calibration.change_maps import Map, blurred, told_maps
+
+_GROUPS = 8
+"""Stretches of the recording, each of which is left out once to see what that changes."""
+_FEWEST = 6
+"""Of them with events, below which nothing is known of errors."""
+_NUMBERS = 10
+"""Fitted at most: gain, lag, and the first eight numbers of the matrix."""
+_LAG_STEP_US = 1_000.0
+_DAMPING = 1e-6
+_MOST_STEPS, _LONGEST_STEP = 5, 16
+_STILL, _STILL_US = 3e-4, 100.0
+"""A step that moves no corner by so much of half the sensor's side, and the clock by no more, is
+the last: a fiftieth of a pixel of the maps."""
+_CORNERS = np.array([[-1.0, 1, -1, 1], [-1, -1, 1, 1], [1, 1, 1, 1]])
+
+Matrix = Float[np.ndarray, "3 3"]
+Basis = Float[np.ndarray, "10 K"]
+"""Which of the numbers change, and which of them together."""
+
+ANY_HOMOGRAPHY: Basis = np.eye(_NUMBERS)
+
+
+def any_similarity(matrix: Matrix) -> Basis:
+    """What leaves a similarity one, of the handedness of ``matrix``."""
+    sign = np.sign(np.linalg.det(matrix[:2, :2]))
+    basis = np.zeros((_NUMBERS, 6))
+    basis[0, 0] = basis[1, 1] = 1
+    basis[[2, 6], 2] = 1, sign
+    basis[[3, 5], 3] = -sign, 1
+    basis[4, 4] = basis[7, 5] = 1
+    return basis
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What is laid onto each other: maps of frames, and the events of the same pairs."""
+
+    frames: Map
+    pairs: Sequence[FramePair]
+    events: EventSource
+    size: tuple[int, int]
+    """Width and height of the sensor."""
+    step: int
+    """Pixels of the sensor to one of its maps."""
+
+    @property
+    def sensor(self) -> tuple[int, int]:
+        """Height and width of the sensor's maps."""
+        return self.size[1] // self.step, self.size[0] // self.step
+
+    @property
+    def grid(self) -> Float[np.ndarray, "3 N"]:
+        """Points (x, y, 1) of the frames' maps, from the middle; 1 is at the longer side's end."""
+        height, width = self.frames.shape[1:]
+        y, x = np.mgrid[:height, :width] * 2.0
+        points = np.stack([x - (width - 1), y - (height - 1)]) / max(height, width)
+        return np.concatenate([points.reshape(2, -1), np.ones((1, x.size))])
+
+    def told(self, lags_us: Float[np.ndarray, "L"]) -> Float32[np.ndarray, "L P h w"]:
+        """What events add up to at each lag, in the sensor's own pixels."""
+        each = [told_maps(one, self.events, lags_us, self.size, self.step) for one in self.pairs]
+        return np.stack(each, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A place of the events and their clock, and the equations of the next step from there."""
+
+    matrix: Matrix
+    """From the frames' `Views.grid` to the sensor's, whose maps are measured likewise."""
+    lag_us: float
+    correlation: float
+    normal: Float[np.ndarray, "G 10 10"]
+    right: Float[np.ndarray, "G 10"]
+    squares: Float[np.ndarray, "G"]
+    """Of what events tell, summed."""
+
+    def step(self, basis: Basis, without: int | None = None) -> Float[np.ndarray, "10"]:
+        """What to add to the numbers, by all groups or all but one; of the gain its value."""
+        normal, right = basis.T @ self.normal @ basis, self.right @ basis
+        kept = [group for group in range(len(right)) if group != without]
+        matrix, vector = normal[kept].sum(0), right[kept].sum(0)
+        size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+        alike = matrix / np.outer(size, size) + _DAMPING * np.eye(len(size))
+        found: Float[np.ndarray, 10] = basis @ (np.linalg.solve(alike, vector / size) / size)
+        return found
+
+    def left_out(self, basis: Basis) -> Float[np.ndarray, "G"]:
+        """Of each group's events, what a step fitted to the others does not tell: squares."""
+        steps = [self.step(basis, without=group) for group in range(len(self.right))]
+        parts = zip(steps, self.normal, self.right, self.squares, strict=True)
+        return np.array([rest - 2 * one @ b + one @ a @ one for one, a, b, rest in parts])
+
+    def error(
+        self, basis: Basis, points: Float[np.ndarray, "3 N"]
+    ) -> tuple[Float[np.ndarray, "N"], float]:
+        """Standard error of where points of the frames' grid lie, in its unit, and of the lag, us.
+
+        Jackknife over groups, which are stretches of the recording; infinite where few tell.
+        """
+        told = [group for group, rest in enumerate(self.squares) if rest > 0]
+        if len(told) < _FEWEST:
+            return np.full(points.shape[1], np.inf), float("inf")
+        whole, back = self.step(basis), np.linalg.inv(self.matrix)
+        steps = np.stack([self.step(basis, without=group) - whole for group in told])
+        places = np.stack([_projected(back @ _changed(self.matrix, one), points) for one in steps])
+        share = (len(told) - 1) / len(told)
+        far = np.square(places - places.mean(0)).sum((0, 1))
+        lag = np.square(steps[:, 1] - steps[:, 1].mean()).sum()
+        return np.sqrt(share * far), float(np.sqrt(share * lag))
+
+
+def fit(
+    views: Views,
+    matrix: Matrix,
+    lag_us: float,
+    basis: Basis,
+    blurs: Sequence[float],
+    most_lag_us: float,
+) -> Fit:
+    """From ``matrix`` and ``lag_us`` to where events fit, by each of ``blurs`` in turn.
+
+    These are in pixels of the frames' maps. Noise of the events makes steps too short, most of all
+    those by which a shift and a lag make up for each other, so that each is doubled while it helps.
+    """
+    found = _equations(views, matrix / matrix[2, 2], lag_us, blurs[0])
+    for blur in blurs:
+        found = _equations(views, found.matrix, found.lag_us, blur)
+        for _ in range(_MOST_STEPS):
+            step = found.step(basis)
+            moves = np.abs(_projected(_changed(found.matrix, step), _CORNERS)
+                           - _projected(found.matrix, _CORNERS)).max()  # fmt: skip
+            if moves < _STILL and abs(step[1]) < _STILL_US:
+                break
+            best, factor = found, 1
+            while factor <= _LONGEST_STEP:
+                lag = float(np.clip(found.lag_us + factor * step[1], -most_lag_us, most_lag_us))
+                tried = _equations(views, _changed(found.matrix, factor * step), lag, blur)
+                if tried.correlation <= best.correlation:
+                    break
+                best, factor = tried, 2 * factor
+            if best is found:
+                break
+            found = best
+    return found
+
+
+def _equations(views: Views, matrix: Matrix, lag_us: float, blur: float) -> Fit:
+    """What events tell, as gain times what frames change by less what a step would change."""
+    height, width = views.sensor
+    half = max(height, width) / 2
+    grid = views.grid
+    w = matrix[2] @ grid
+    at = _projected(matrix, grid)
+    x, y = at * half + np.array([[(width - 1) / 2], [(height - 1) / 2]])
+    inside = (w > 0) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    # blurred alike in the pictures, whatever the size of the pixels
+    finer = np.sqrt(abs(np.linalg.det(matrix[:2, :2]))) * half * 2 / max(views.frames.shape[1:])
+    before, told, after = views.told(lag_us + np.array([-1.0, 0, 1]) * _LAG_STEP_US)
+    seen = blurred(told, blur * finer)
+    late = blurred(after - before, blur * finer) / (2 * _LAG_STEP_US)
+    right, down = (np.gradient(seen * half, axis=axis) for axis in (2, 1))
+    target = blurred(views.frames, blur).reshape(len(seen), -1)[:, inside]
+    groups = np.arange(len(seen)) * _GROUPS // len(seen)
+    found = Fit(
+        matrix,
+        lag_us,
+        0.0,
+        np.zeros((_GROUPS, _NUMBERS, _NUMBERS)),
+        np.zeros((_GROUPS, _NUMBERS)),
+        np.zeros(_GROUPS),
+    )
+    to = np.stack([y, x])[:, inside]
+    for group, change, *maps in zip(groups, target, seen, late, right, down, strict=True):
+        value, later, dx, dy = (map_coordinates(one, to, order=1) for one in maps)
+        columns = _columns(change, later, dx / w[inside], dy / w[inside], grid, at, inside)
+        found.normal[group] += columns @ columns.T
+        found.right[group] += columns @ value
+        found.squares[group] += value @ value
+    power = found.normal[:, 0, 0].sum() * found.squares.sum()
+    correlation = found.right[:, 0].sum() / np.sqrt(power) if power > 0 else 0.0
+    return replace(found, correlation=float(correlation))
+
+
+def _columns(
+    change: Float[np.ndarray, "N"],
+    later: Float[np.ndarray, "N"],
+    dx: Float[np.ndarray, "N"],
+    dy: Float[np.ndarray, "N"],
+    grid: Float[np.ndarray, "3 M"],
+    at: Float[np.ndarray, "2 M"],
+    inside: Bool[np.ndarray, "M"],
+) -> Float[np.ndarray, "10 N"]:
+    """By what each number changes what events tell, with its sign: they are told less a step."""
+    x, y = grid[:2, inside]
+    dw = -(dx * at[0, inside] + dy * at[1, inside])
+    return np.stack([change, -later, *(-one for d in (dx, dy) for one in (d * x, d * y, d)),
+                     -dw * x, -dw * y])  # fmt: skip
+
+
+def _changed(matrix: Matrix, step: Float[np.ndarray, "10"]) -> Matrix:
+    return matrix + np.append(step[2:], 0).reshape(3, 3)
+
+
+def _projected(matrix: Matrix, points: Float[np.ndarray, "3 N"]) -> Float[np.ndarray, "2 N"]:
+    x, y, w = matrix @ points
+    return np.stack([x, y]) / np.where(w > 0, w, np.inf)

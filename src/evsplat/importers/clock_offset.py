@@ -1,0 +1,104 @@
+"""The offset between the clocks of events and pictures, as it is given or found on import."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+from evsplat.calibration.offset import (
+    LEAST_CORRELATION,
+    BlockChanges,
+    OffsetEstimate,
+    TooLong,
+    estimate_offset,
+)
+from evsplat.calibration.ways import in_words, way_homography, ways_of
+from evsplat.errors import ConfigError, DataError
+from evsplat.events import EventStream, moved
+
+
+def offset_or_levels(
+    clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
+) -> int | BlockChanges:
+    """The clock's offset; where it is to be found, what is to be gathered of the frames for it."""
+    if not isinstance(clock_offset_us, str):
+        return clock_offset_us
+    if clock_offset_us != "auto":
+        raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
+    return BlockChanges(camera.get("transfer", "power"))
+
+
+def likely_offset(
+    levels: BlockChanges, events: Iterable[EventStream], path: Path, size: tuple[int, int]
+) -> OffsetEstimate | None:
+    """`estimate_offset`, which need not be certain; raises where the recording is too long."""
+    try:
+        return estimate_offset(levels, events, size)
+    except TooLong as error:
+        raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
+
+
+def found_offset(
+    levels: BlockChanges,
+    pieces: Callable[[], Iterable[EventStream]],
+    path: Path,
+    size: tuple[int, int],
+    *,
+    one_file: bool,
+) -> tuple[int, str]:
+    """The offset of the events' clock, us, and a note of it; raises where it is not certain.
+
+    ``one_file``: the pictures are in ``path`` as well.
+    """
+    found = likely_offset(levels, pieces(), path, size)
+    give = "give --clock-offset-us US, or film more that moves"
+    if one_file:
+        give = "leave --clock-offset-us out, as a sensor has one clock for both; or " + give
+    if found is None or not found.is_certain:
+        _refuse_turned(levels, pieces, path, size)
+    if found is None or found.correlation < LEAST_CORRELATION:
+        best = "" if found is None else f" (correlation {found.correlation:.2f} at best)"
+        raise DataError(
+            f"{path}: its events agree with the changes of the pictures at no offset of the "
+            f"clocks{best}; {give}."
+        )
+    offset_us = 100 * round(found.offset_us / 100)
+    if not found.is_certain:
+        raise DataError(
+            f"{path}: its events agree with the changes of the pictures at {offset_us} us "
+            f"(correlation {found.correlation:.2f}) hardly better than elsewhere "
+            f"({found.rival:.2f}); {give}."
+        )
+    note = (
+        f"events: the offset of their clock is found, {offset_us} us (correlation "
+        f"{found.correlation:.2f}, elsewhere {found.rival:.2f} at most)"
+    )
+    return offset_us, note
+
+
+def _refuse_turned(
+    levels: BlockChanges,
+    pieces: Callable[[], Iterable[EventStream]],
+    path: Path,
+    size: tuple[int, int],
+) -> None:
+    """Raise where events that were mirrored or inverted would have an offset that is certain."""
+    found = []
+    for (name, way), inverted in product(ways_of(size).items(), (False, True)):
+        turned = moved(pieces(), way_homography(way, size), *size)
+        if inverted:
+            turned = (replace(piece, p=-piece.p) for piece in turned)
+        words = in_words(name, inverted=inverted)
+        offset = estimate_offset(levels, turned, size) if words else None
+        if offset is not None and offset.is_certain:
+            found.append((offset.correlation, words, offset.offset_us))
+    if found:
+        # of ways that fit alike, as those of a scene that is the same upside down, the plainest
+        correlation, words, offset_us = max(found, key=lambda one: round(one[0], 3))
+        raise DataError(
+            f"{path}: its events agree with the changes of the pictures only if they were {words} "
+            f"(correlation {correlation:.2f}, at an offset of {offset_us:.0f} us); write them anew "
+            "that way by 'evsplat convert --invert' or 'evsplat convert --homography' "
+            "(docs/event-formats.md), or the pictures."
+        )

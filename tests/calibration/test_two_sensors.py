@@ -1,0 +1,118 @@
+"""Where the events of another sensor lie over pictures is found, or it is said that it is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from evsplat.calibration.two_sensors import ChangesSeen, SensorPlace, estimate_place
+from evsplat.calibration.ways import WAYS, way_homography
+from evsplat.events import EventStream
+
+from .film import (
+    FRAMES,
+    HEIGHT,
+    PERIOD_US,
+    WIDTH,
+    Film,
+    drawn_place,
+    filmed_swing,
+    recorded_by,
+)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(int(np.random.default_rng().integers(1_000_000)))
+
+
+def gathered(film: Film) -> ChangesSeen:
+    seen = ChangesSeen(film.spans_us, "power")
+    for picture, span in zip(film.pictures, film.spans_us, strict=True):
+        seen.add(torch.from_numpy(picture), span)
+    return seen
+
+
+def found(film: Film, events: EventStream, size: tuple[int, int]) -> SensorPlace | None:
+    seen = gathered(film)
+    return estimate_place(seen, seen.events([events], 0), size)
+
+
+def off_px(place: SensorPlace, film: Film, matrix: np.ndarray) -> float:
+    """Of where events of the film belong, how far from there most of them are put."""
+    points = np.stack([film.events.x, film.events.y, np.ones(len(film.events))])
+    back = place.homography @ matrix @ points
+    return float(np.quantile(np.hypot(*(back[:2] / back[2] - points[:2])), 0.9))
+
+
+@pytest.mark.parametrize("perspective", [0.0, 0.12])
+def test_scale_turn_shift_and_perspective_are_found_whatever_the_sensors_size(
+    rng: np.random.Generator, perspective: float
+) -> None:
+    film = filmed_swing(int(rng.integers(1_000_000)))
+    matrix, size = drawn_place(rng, perspective=perspective)
+    late = int(rng.integers(-40_000, 40_000))
+    events = recorded_by(film.events, matrix, size, rng)
+    place = found(film, replace(events, t=events.t + late), size)
+    assert place is not None and place.doubt == ""
+    assert place.way == "" and not place.inverted and place.sensor_px == size
+    assert place.size_px == (WIDTH, HEIGHT)
+    # two thirds of a pixel of the sensor or the pictures, whichever is larger
+    assert off_px(place, film, matrix) < 0.7 * max(1, WIDTH / size[0])
+    assert place.lag_us == pytest.approx(late, abs=8_000)
+
+
+def test_mirrors_quarter_turns_and_the_other_polarity_are_found(rng: np.random.Generator) -> None:
+    film = filmed_swing(int(rng.integers(1_000_000)))
+    matrix, size = drawn_place(rng)
+    name = str(rng.choice([one for one in WAYS if one]))
+    # from the frames to the events is the other way round
+    turned = size if WAYS[name][0, 0] else size[::-1]
+    away = way_homography(WAYS[name].T, size)
+    away[:2, 2] = (np.array(turned) - 1) / 2 - WAYS[name].T @ ((np.array(size) - 1) / 2)
+    events = recorded_by(film.events, away @ matrix, turned, rng)
+    place = found(film, replace(events, p=-events.p), turned)
+    assert place is not None and place.doubt == ""
+    assert place.way == name and place.inverted and name in str(place)
+    assert off_px(place, film, away @ matrix) < 0.7 * max(1, WIDTH / size[0])
+
+
+def test_events_of_another_scene_or_noise_are_not_relied_on(rng: np.random.Generator) -> None:
+    ours, others = (filmed_swing(int(one)) for one in rng.integers(1_000_000, size=2))
+    matrix, size = drawn_place(rng)
+    place = found(ours, recorded_by(others.events, matrix, size, rng), size)
+    assert place is None or place.doubt
+    count = 20_000
+    noise = EventStream(
+        np.sort(rng.integers(0, FRAMES * PERIOD_US, count)),
+        rng.integers(0, size[0], count).astype(np.uint16),
+        rng.integers(0, size[1], count).astype(np.uint16),
+        rng.choice(np.array([-1, 1], np.int8), count),
+    )
+    place = found(ours, noise, size)
+    assert place is None or "nowhere" in place.doubt
+
+
+def test_nothing_is_found_where_nothing_moves_or_no_event_came(rng: np.random.Generator) -> None:
+    film = filmed_swing(int(rng.integers(1_000_000)))
+    still = replace(film, pictures=film.pictures[:1] * FRAMES)
+    matrix, size = drawn_place(rng)
+    events = recorded_by(film.events, matrix, size, rng)
+    assert found(still, events, size) is None
+    assert found(film, events.take(slice(0, 0)), size) is None
+    assert found(replace(film, pictures=film.pictures[:1], spans_us=[(0, 9)]), events, size) is None
+
+
+def test_events_are_gathered_by_pieces_at_times_of_the_frames(rng: np.random.Generator) -> None:
+    film = filmed_swing(int(rng.integers(1_000_000)))
+    seen = gathered(film)
+    offset = int(rng.integers(-(10**9), 10**9))
+    given = replace(film.events, t=film.events.t - offset)
+    cuts = [0, *np.sort(rng.integers(0, len(given), 5)).tolist(), len(given)]
+    pieces = [given.take(slice(a, b)) for a, b in zip(cuts, cuts[1:], strict=False)]
+    gathered_events = seen.events(pieces, offset)
+    assert np.array_equal(gathered_events.t, film.events.t)
+    assert np.array_equal(gathered_events.x, film.events.x)
+    far = seen.events(pieces, offset + 10 * FRAMES * PERIOD_US)
+    assert len(far) == 0
