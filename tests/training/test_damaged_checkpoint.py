@@ -100,6 +100,16 @@ def test_what_is_not_the_model_s_is_not_drawn(trained: Path, tmp_path: Path, sai
         load_run(run)
 
 
+@pytest.mark.parametrize("name", ["shade.network.biases.2", "relief.coarse"])
+def test_numbers_that_overflow_in_the_picture_are_told(
+    trained: Path, tmp_path: Path, name: str
+) -> None:
+    enormous = tensor(f"model.{name}", lambda v: torch.full_like(v, 1e9))
+    run = load_run(damaged(trained, tmp_path / "run", enormous))
+    with pytest.raises(DataError, match="draws numbers that are not finite .* checkpoint"):
+        run.reconstruction.render(run.capture.camera("0000"), [15_000])
+
+
 @pytest.mark.parametrize("said", RESUMED)
 def test_what_is_not_the_training_s_is_not_gone_on_from(
     trained: Path, tmp_path: Path, said: str
@@ -118,6 +128,9 @@ def test_a_capture_that_was_moved_is_found_where_the_run_is_told(
     facts = json.loads((run / "versions.json").read_text())
     (run / "versions.json").write_text(json.dumps(facts | {"capture": str(tmp_path / "gone")}))
     with pytest.raises(DataError, match="gone: not found, expected the capture that .*put it back"):
+        load_run(run)
+    (run / "versions.json").write_text(json.dumps(facts | {"capture": 5_000 * "x"}))
+    with pytest.raises(DataError, match="x: not found, expected the capture that"):
         load_run(run)
     (run / "versions.json").write_text(json.dumps(facts))
     assert load_run(run).iteration == 4

@@ -40,7 +40,12 @@ class GaussianReconstruction:
     """What pictures of person and scene show where nothing is; black without."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
-        """Pictures at the given times; see `Reconstruction`."""
+        """Pictures at the given times; see `Reconstruction`.
+
+        Raises:
+            DataError: A picture is not finite, as of a checkpoint that somebody changed: numbers
+                that are finite themselves overflow in it.
+        """
         with torch.no_grad():
             camera, layers = self._posed(camera, times_us)
             if parts == "all":
@@ -55,6 +60,12 @@ class GaussianReconstruction:
                 layer = layers.human if parts == "human" else layers.scene
                 output = render(layer, camera, low_pass=layers.low_pass)
                 rgb, human, alpha = output.image[..., :3], output.image[..., 3], output.alpha
+        if not bool(rgb.sum().isfinite()):
+            raise DataError(
+                f"the trained model ({self.name}) draws numbers that are not finite at "
+                f"{int(times_us[0])} us, expected light: its run's last checkpoint is damaged. "
+                "Remove that file, so that the one before is taken, or train anew."
+            )
         # The scene alone is drawn once.
         shape = len(times_us), camera.height, camera.width
         return Rendering(

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import platform
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -268,10 +269,10 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         raise DataError(f"{folder.checkpoints}: no checkpoint; train the run first.")
     path, tensors, progress = loaded
     place = Path(facts["capture"])
-    if not place.is_dir():
+    if not os.path.isdir(place):  # unlike `Path.is_dir` False of a name that no file may have
         raise DataError(
-            f"{place}: not found, expected the capture that {folder.path} was trained on; put it "
-            f"back, or write its new place under 'capture' in {folder.facts}."
+            f"{str(place)[:1000]}: not found, expected the capture that {folder.path} was trained "
+            f"on; put it back, or write its new place under 'capture' in {folder.facts}."
         )
     capture = load_capture(place, warn=False)  # its training has
     if config.policy.use == "everything":
