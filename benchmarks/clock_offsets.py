@@ -67,11 +67,11 @@ def part_of(length: int, least: float, rng: np.random.Generator) -> tuple[int, i
 
 def search(capture: Capture, frames: Sequence[Frame], events: EventStream) -> OffsetEstimate | None:
     """The offset of ``events`` among these frames of a capture."""
-    levels = BlockChanges(capture.transfer(frames[0]))
+    changes = BlockChanges(capture.transfer(frames[0]))
     for frame in frames:
-        levels.add(capture.image(frame), frame.exposure_us)
+        changes.add(capture.image(frame), frame.exposure_us)
     camera = capture.camera(frames[0])
-    return estimate_offset(levels, [events], (camera.width, camera.height))
+    return estimate_offset(changes, [events], (camera.width, camera.height))
 
 
 def outcome(kind: str, found: OffsetEstimate | None, true_us: int | None) -> Outcome:

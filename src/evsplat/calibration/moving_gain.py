@@ -16,7 +16,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from evsplat.calibration.gain import BRIGHTEST, gains_of_levels, light_in_squares
-from evsplat.calibration.overlay import back, carried, laid_over, one_after_the_other, unmoved
+from evsplat.calibration.overlay import (
+    INSIDE,
+    back,
+    carried,
+    laid_over,
+    one_after_the_other,
+    unmoved,
+)
 from evsplat.pictures.light import Transfer
 
 _SIDE = 48
@@ -31,7 +38,6 @@ _APART = (1, 2, 4, 8)
 _BATCH = 128
 _BLOCK = 4
 """Pixels along a block, whose mean of light is compared."""
-_INSIDE = 0.99
 _LEAST_OVERLAP = 0.3
 """Share of the blocks that both pictures show, below which a pair tells nothing."""
 _MOST_SPREAD = 0.25
@@ -143,7 +149,7 @@ def _change(
     ways: Float[Tensor, "P 2 3"],
 ) -> tuple[Float[Tensor, "P C"], Float[Tensor, "P C"]]:
     """Median over blocks of what the logarithm of their light changes by; its standard error."""
-    both = ((carried(usable_after.float(), ways) > _INSIDE) & usable_before).float()
+    both = ((carried(usable_after.float(), ways) > INSIDE) & usable_before).float()
     shared = avg_pool2d(both, _BLOCK) > 0.5
     seen_before, seen_after = (
         avg_pool2d(light * both, _BLOCK) for light in (before, carried(after, ways))

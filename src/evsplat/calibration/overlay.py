@@ -14,7 +14,8 @@ _POOLED = (4, 2, 1)
 _ROUNDS = 8
 """Steps of Gauss-Newton at each."""
 _DAMPING = 1e-4
-_INSIDE = 0.99
+INSIDE = 0.99
+"""What is carried of a map of ones is more where a whole pixel of it lies there."""
 _LEAST_ERROR = 1e-3
 
 
@@ -63,7 +64,7 @@ def laid_over(logs: Float[Tensor, "P 2 H W"], usable: Bool[Tensor, "P 2 H W"], s
         x, y = affine_grid(unmoved(1), [1, 1, rows, columns], align_corners=False)[0].unbind(-1)
         for _ in range(_ROUNDS):
             value, along_x, along_y, covered = carried(stack, ways).unbind(1)
-            inside = (covered > _INSIDE) & (seen[:, 0] > _INSIDE)
+            inside = (covered > INSIDE) & (seen[:, 0] > INSIDE)
             error = torch.where(inside, value - here[:, 0] - change[:, None, None], 0.0)
             usual = torch.where(inside, error.abs(), torch.nan).flatten(1).nanmedian(1).values
             scale = 3 * usual.nan_to_num().clamp_min(_LEAST_ERROR)[:, None, None]

@@ -18,7 +18,7 @@ from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, moved
 
 
-def offset_or_levels(
+def offset_or_changes(
     clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
 ) -> int | BlockChanges:
     """The clock's offset; where it is to be found, what is to be gathered of the frames for it."""
@@ -30,17 +30,17 @@ def offset_or_levels(
 
 
 def likely_offset(
-    levels: BlockChanges, events: Iterable[EventStream], path: Path, size: tuple[int, int]
+    changes: BlockChanges, events: Iterable[EventStream], path: Path, size: tuple[int, int]
 ) -> OffsetEstimate | None:
     """`estimate_offset`, which need not be certain; raises where the recording is too long."""
     try:
-        return estimate_offset(levels, events, size)
+        return estimate_offset(changes, events, size)
     except TooLong as error:
         raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
 
 
 def found_offset(
-    levels: BlockChanges,
+    changes: BlockChanges,
     pieces: Callable[[], Iterable[EventStream]],
     path: Path,
     size: tuple[int, int],
@@ -51,12 +51,12 @@ def found_offset(
 
     ``one_file``: the pictures are in ``path`` as well.
     """
-    found = likely_offset(levels, pieces(), path, size)
+    found = likely_offset(changes, pieces(), path, size)
     give = "give --clock-offset-us US, or film more that moves"
     if one_file:
         give = "leave --clock-offset-us out, as a sensor has one clock for both; or " + give
     if found is None or not found.is_certain:
-        _refuse_turned(levels, pieces, path, size)
+        _refuse_turned(changes, pieces, path, size)
     if found is None or found.correlation < LEAST_CORRELATION:
         best = "" if found is None else f" (correlation {found.correlation:.2f} at best)"
         raise DataError(
@@ -78,7 +78,7 @@ def found_offset(
 
 
 def _refuse_turned(
-    levels: BlockChanges,
+    changes: BlockChanges,
     pieces: Callable[[], Iterable[EventStream]],
     path: Path,
     size: tuple[int, int],
@@ -90,7 +90,7 @@ def _refuse_turned(
         if inverted:
             turned = (replace(piece, p=-piece.p) for piece in turned)
         words = in_words(name, inverted=inverted)
-        offset = estimate_offset(levels, turned, size) if words else None
+        offset = estimate_offset(changes, turned, size) if words else None
         if offset is not None and offset.is_certain:
             found.append((offset.correlation, words, offset.offset_us))
     if found:

@@ -15,7 +15,7 @@ from evsplat.errors import DataError
 from evsplat.events import EventRecording, EventStream, RecordedFrame, open_recording
 from evsplat.footage import TimedPicture
 from evsplat.importers.base import Importer, chosen_frames, need
-from evsplat.importers.clock_offset import offset_or_levels
+from evsplat.importers.clock_offset import offset_or_changes
 from evsplat.importers.option_types import (
     ClockOffset,
     Contrast,
@@ -85,7 +85,7 @@ class Davis(Importer):
         camera, focal, guessed = recorded_camera(self.camera, self.focal, size)
         camera, small = shrunk_camera({**camera, "transfer": self.transfer}, size, self.shrink)
         writer.add_camera("main", *small, **camera)
-        clock_offset = offset_or_levels(self.clock_offset_us, camera)
+        clock_offset = offset_or_changes(self.clock_offset_us, camera)
         wanted, numbered = set(kept), enumerate(recording.frames())
         for index, frame in tqdm(numbered, "pictures", len(spans), leave=False):
             if index in wanted:

@@ -22,7 +22,7 @@ from evsplat.importers.base import (
     need,
     short_exposure,
 )
-from evsplat.importers.clock_offset import offset_or_levels
+from evsplat.importers.clock_offset import offset_or_changes
 from evsplat.importers.exposures import read_exposures
 from evsplat.importers.option_types import (
     ClockOffset,
@@ -117,7 +117,7 @@ class Folder(Importer):
         seen = _with_poses(kept, motion, middles, path)
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
-        clock_offset = offset_or_levels(self.clock_offset_us, camera)
+        clock_offset = offset_or_changes(self.clock_offset_us, camera)
         spans = {index: (int(exposures[index, 0]), int(exposures[index, 1])) for index in seen}
         finder = place_finder(self.homography, list(spans.values()), camera)
         for index, timed in pictures_of(footage, seen):

@@ -100,7 +100,7 @@ def add_recorded_frame(
     mask: Float[np.ndarray, "H W"] | None = None,
     world_to_camera: Float[np.ndarray, "4 4"] | None = None,
 ) -> None:
-    """Write a frame of camera "main"; gather its levels where the clock's offset is to be found.
+    """Write a frame of camera "main"; gather its changes where the clock's offset is to be found.
 
     Picture and mask are made smaller by ``shrink``.
     """
@@ -131,7 +131,7 @@ def add_recorded_events(
 ) -> list[str]:
     """Write the events of a recording of any format; gives notes for the user.
 
-    ``clock_offset`` is in us, or the levels of the frames by which it is found. ``exposed_only``
+    ``clock_offset`` is in us, or the changes of the frames by which it is found. ``exposed_only``
     leaves out events before the first exposure and after the last. ``size`` is that of the pictures
     as recorded, in whose pixels the events are, or are brought by ``mover``, which may have to be
     found; both are made smaller by ``shrink``.

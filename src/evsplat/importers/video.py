@@ -13,7 +13,7 @@ from evsplat.importers.base import (
     exposure_around,
     short_exposure,
 )
-from evsplat.importers.clock_offset import offset_or_levels
+from evsplat.importers.clock_offset import offset_or_changes
 from evsplat.importers.option_types import (
     ClockOffset,
     Contrast,
@@ -87,7 +87,7 @@ class Video(Importer):
             camera["transfer"] = self.transfer
         camera, small = shrunk_camera(camera, size, self.shrink)
         writer.add_camera("main", *small, **camera)
-        clock_offset = offset_or_levels(self.clock_offset_us, camera)
+        clock_offset = offset_or_changes(self.clock_offset_us, camera)
         kept = chosen_frames(self.frames, list(range(len(footage.times_us))), source)
         middles = (footage.times_us + self.start_us).tolist()
         spans = {index: exposure_around(middles[index], self.exposure_us) for index in kept}
