@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import gaussian_filter
 
-from evsplat.calibration.brightness import EventSource, FramePair
+from evsplat.calibration.brightness import HISTORY_US, EventSource, FramePair, level_steps
 from evsplat.events.maps import event_pixels
 
 _MOST_EVENTS = 200_000
@@ -24,30 +24,43 @@ def change_map(pair: FramePair) -> Float32[np.ndarray, "H W"]:
     return np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE).astype(np.float32)
 
 
-def told_maps(
-    pair: FramePair,
-    events: EventSource,
-    lags_us: Float[np.ndarray, "L"],
-    size: tuple[int, int],
-    step: int,
-) -> Float32[np.ndarray, "L h w"]:
-    """Sums of polarities at each lag, of what may be read: means over squares of ``step`` pixels.
+class Told:
+    """What events add up to about a pair of frames, in the sensor's own pixels, at any lag."""
 
-    ``size`` is width and height of the sensor. What is left at the right and below is cut off.
-    """
-    (start, end), (low, high) = pair.span_us, pair.recorded_us
-    first = max(start + math.floor(lags_us[0]), low)
-    near = events.between(first, max(first, min(end + math.ceil(lags_us[-1]), high)))
-    near = near.take(slice(None, None, max(1, len(near) // _MOST_EVENTS)))
-    width, height = (side // step for side in size)
-    small = replace(near, x=near.x // step, y=near.y // step)
-    small = small.take((small.x < width) & (small.y < height))
-    pixel = event_pixels(small, height, width)
-    maps = np.empty((len(lags_us), height, width), np.float32)
-    for one, lag in zip(maps, lags_us, strict=True):
-        weights = pair.weights(small.t - lag) * small.p
-        one[:] = np.bincount(pixel, weights, height * width).reshape(height, width) / step**2
-    return np.clip(maps, -_MOST_THRESHOLDS, _MOST_THRESHOLDS)
+    def __init__(
+        self,
+        pair: FramePair,
+        events: EventSource,
+        most_lag_us: float,
+        size: tuple[int, int],
+        step: int,
+    ) -> None:
+        """Read what may be, for lags up to ``most_lag_us`` either way.
+
+        ``size`` is width and height of the sensor, whose maps are means over squares of ``step``
+        pixels. What is left at the right and below is cut off.
+        """
+        (start, end), (low, high) = pair.span_us, pair.recorded_us
+        most = math.ceil(most_lag_us)
+        first = max(start - most - HISTORY_US, low)
+        near = events.between(first, max(first, min(end + most, high)))
+        lifts = level_steps(event_pixels(near, size[1], size[0]), near.p > 0)
+        shown = slice(None, None, max(1, len(near) // _MOST_EVENTS))
+        near, lifts = near.take(shown), lifts[shown]
+        self._shape = size[1] // step, size[0] // step
+        small = replace(near, x=near.x // step, y=near.y // step)
+        inside = (small.x < self._shape[1]) & (small.y < self._shape[0])
+        self._t, self._lifts = small.t[inside], lifts[inside] / step**2
+        self._pixel = event_pixels(small.take(inside), *self._shape)
+        self._pair = pair
+
+    def maps(self, lags_us: Float[np.ndarray, "L"]) -> Float32[np.ndarray, "L h w"]:
+        """Sums of how far events lift the most likely levels (`level_steps`), in thresholds."""
+        maps = np.empty((len(lags_us), *self._shape), np.float32)
+        for one, lag in zip(maps, lags_us, strict=True):
+            weights = self._pair.weights(self._t - lag) * self._lifts
+            one[:] = np.bincount(self._pixel, weights, one.size).reshape(self._shape)
+        return np.clip(maps, -_MOST_THRESHOLDS, _MOST_THRESHOLDS)
 
 
 def blurred(maps: Map, sigma: float) -> Map:

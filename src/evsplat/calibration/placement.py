@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 from scipy.ndimage import affine_transform
 
 from evsplat.calibration.brightness import EventSource, FramePair
-from evsplat.calibration.change_maps import Map, blurred, change_map, told_maps
+from evsplat.calibration.change_maps import Map, Told, blurred, change_map
 from evsplat.calibration.clock import SEARCH_US
 from evsplat.events.homography import Homography
 from evsplat.pictures.squares import square_means
@@ -117,7 +117,8 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
     most = 1 + math.ceil(max(SEARCH_US / gap_us, 1) * _STEPS)
     lags = np.arange(-most, most + 1) * gap_us / _STEPS
     size = width, height
-    told = np.stack([told_maps(pair, events, lags, size, step) for pair in chosen], axis=1)
+    sums = (Told(pair, events, lags[-1], size, step).maps(lags) for pair in chosen)
+    told = np.stack(list(sums), axis=1)
     if not frames.any() or not told.any():
         return None
     coarse = range(1, len(lags), 2)

@@ -6,13 +6,14 @@ the place and of the lag of the events' clock together.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.ndimage import map_coordinates
 
 from evsplat.calibration.brightness import EventSource, FramePair
-from evsplat.calibration.change_maps import Map, blurred, told_maps
+from evsplat.calibration.change_maps import Map, Told, blurred
 
 _GROUPS = 8
 """Stretches of the recording, each of which is left out once to see what that changes."""
@@ -57,6 +58,8 @@ class Views:
     """Width and height of the sensor."""
     step: int
     """Pixels of the sensor to one of its maps."""
+    most_lag_us: float
+    """Clocks differ by no more."""
 
     @property
     def sensor(self) -> tuple[int, int]:
@@ -73,8 +76,12 @@ class Views:
 
     def told(self, lags_us: Float[np.ndarray, "L"]) -> Float32[np.ndarray, "L P h w"]:
         """What events add up to at each lag, in the sensor's own pixels."""
-        each = [told_maps(one, self.events, lags_us, self.size, self.step) for one in self.pairs]
-        return np.stack(each, axis=1)
+        return np.stack([one.maps(lags_us) for one in self._told], axis=1)
+
+    @cached_property
+    def _told(self) -> list[Told]:
+        most = self.most_lag_us + _LAG_STEP_US
+        return [Told(one, self.events, most, self.size, self.step) for one in self.pairs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +138,13 @@ def fit(
     lag_us: float,
     basis: Basis,
     blurs: Sequence[float],
-    most_lag_us: float,
 ) -> Fit:
     """From ``matrix`` and ``lag_us`` to where events fit, by each of ``blurs`` in turn.
 
     These are in pixels of the frames' maps. Noise of the events makes steps too short, most of all
     those by which a shift and a lag make up for each other, so that each is doubled while it helps.
     """
+    most = views.most_lag_us
     found = _equations(views, matrix / matrix[2, 2], lag_us, blurs[0])
     for blur in blurs:
         found = _equations(views, found.matrix, found.lag_us, blur)
@@ -149,7 +156,7 @@ def fit(
                 break
             best, factor = found, 1
             while factor <= _LONGEST_STEP:
-                lag = float(np.clip(found.lag_us + factor * step[1], -most_lag_us, most_lag_us))
+                lag = float(np.clip(found.lag_us + factor * step[1], -most, most))
                 tried = _equations(views, _changed(found.matrix, factor * step), lag, blur)
                 if tried.correlation <= best.correlation:
                     break

@@ -182,7 +182,7 @@ def estimate_place(
     gap_us = float(np.median([one.gap_us for one in pairs]))
     count = math.ceil(2 * SEARCH_US / gap_us)
     lags = np.arange(-count, count + 1) * gap_us / 2
-    views = Views(frames, pairs, events, size, step)
+    views = Views(frames, pairs, events, size, step, float(lags[-1]))
     told = views.told(lags)
     if not told.any():
         return None
@@ -238,14 +238,14 @@ def _fitted(
     to_sensor = _middle(views.sensor, views.step, unit=True)
     start = to_sensor @ np.linalg.inv(to_picture @ homography)
     basis = any_similarity(start)
-    found = fit(views, start, lag_us, basis, _COARSE, SEARCH_US)
+    found = fit(views, start, lag_us, basis, _COARSE)
     plain, free = found.left_out(basis), found.left_out(ANY_HOMOGRAPHY)
     gain = plain - free
     surely = gain.mean() > _SURELY_BETTER * gain.std(ddof=1) / math.sqrt(len(gain))
     half = max(frames.shape[1:]) / 2 * step
     error = _of_most(found.error(basis, views.grid)[0], frames) * half
     if surely and gain.sum() > _BETTER * plain.sum():
-        better = fit(views, found.matrix, found.lag_us, ANY_HOMOGRAPHY, _FINE, SEARCH_US)
+        better = fit(views, found.matrix, found.lag_us, ANY_HOMOGRAPHY, _FINE)
         of_better = _of_most(better.error(ANY_HOMOGRAPHY, views.grid)[0], frames) * half
         if better.correlation > found.correlation and of_better <= MOST_ERROR * 2 * half:
             found, error = better, of_better
