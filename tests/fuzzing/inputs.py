@@ -27,7 +27,10 @@ _DAMAGE = {
 
 
 def rng_of(name: str, seed: int, number: int) -> Rng:
-    """The numbers of one input, the same on every machine."""
+    """The numbers of one input, the same on every machine.
+
+    What they spoil depends on the sound files, whose lengths differ by the times within them.
+    """
     return np.random.default_rng([seed, zlib.crc32(name.encode()), number])
 
 
