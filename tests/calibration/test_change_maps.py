@@ -65,3 +65,20 @@ def test_events_that_may_not_be_read_tell_nothing() -> None:
     within = events.take((events.t >= 10_000) & (events.t < 30_000))
     alone = Told(pair, within, 0, (WIDTH, HEIGHT), 1).maps(np.zeros(1))
     assert maps.any() and np.array_equal(maps, alone)
+
+
+def test_what_fills_no_square_is_cut_off() -> None:
+    events = recorded(5, late_us=0)
+    pair = FramePair(
+        (30_000, 34_000),
+        (80_000, 84_000),
+        np.zeros((HEIGHT, WIDTH)),
+        np.ones((HEIGHT, WIDTH), bool),
+        ALWAYS,
+    )
+    size = WIDTH - 9, HEIGHT - 2  # events lie beyond the sensor, too
+    maps = Told(pair, events, 0, size, 7).maps(np.zeros(1))
+    single = Told(pair, events, 0, (WIDTH, HEIGHT), 1).maps(np.zeros(1))
+    within = single[:, : size[1] // 7 * 7, : size[0] // 7 * 7]
+    means = within.reshape(1, size[1] // 7, 7, size[0] // 7, 7).mean((2, 4))
+    assert np.allclose(maps, means, atol=1e-5)

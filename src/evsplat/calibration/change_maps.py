@@ -44,14 +44,13 @@ class Told:
         most = math.ceil(most_lag_us)
         first = max(start - most - HISTORY_US, low)
         near = events.between(first, max(first, min(end + most, high)))
-        lifts = level_steps(event_pixels(near, size[1], size[0]), near.p > 0)
-        shown = slice(None, None, max(1, len(near) // _MOST_EVENTS))
-        near, lifts = near.take(shown), lifts[shown]
         self._shape = size[1] // step, size[0] // step
+        near = near.take((near.y // step < self._shape[0]) & (near.x // step < self._shape[1]))
+        lifts = level_steps(event_pixels(near, size[1], size[0]), near.p > 0)
+        some = slice(None, None, max(1, len(near) // _MOST_EVENTS))
+        near, self._lifts = near.take(some), lifts[some] / step**2
         small = replace(near, x=near.x // step, y=near.y // step)
-        inside = (small.x < self._shape[1]) & (small.y < self._shape[0])
-        self._t, self._lifts = small.t[inside], lifts[inside] / step**2
-        self._pixel = event_pixels(small.take(inside), *self._shape)
+        self._t, self._pixel = near.t, event_pixels(small, *self._shape)
         self._pair = pair
 
     def maps(self, lags_us: Float[np.ndarray, "L"]) -> Float32[np.ndarray, "L h w"]:
