@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from evsplat.calibration.clock import estimate_clock
-from evsplat.calibration.two_sensors import ChangesSeen, SensorPlace, estimate_place
+from evsplat.calibration.two_sensors import SensorPlace
 from evsplat.calibration.ways import WAYS, way_homography
 from evsplat.events import EventStream
 
@@ -17,8 +16,11 @@ from .film import (
     PERIOD_US,
     WIDTH,
     Film,
+    drawn_film,
     drawn_place,
     filmed_swing,
+    found,
+    gathered_changes,
     recorded_by,
 )
 
@@ -28,36 +30,11 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(int(np.random.default_rng().integers(1_000_000)))
 
 
-def gathered(film: Film) -> ChangesSeen:
-    seen = ChangesSeen(film.spans_us, "power")
-    for picture, span in zip(film.pictures, film.spans_us, strict=True):
-        seen.add(torch.from_numpy(picture), span)
-    return seen
-
-
-def found(film: Film, events: EventStream, size: tuple[int, int]) -> SensorPlace | None:
-    seen = gathered(film)
-    return estimate_place(seen, seen.events([events], 0), size)
-
-
 def off_px(place: SensorPlace, film: Film, matrix: np.ndarray) -> float:
     """Of where events of the film belong, how far from there most of them are put."""
     points = np.stack([film.events.x, film.events.y, np.ones(len(film.events))])
     back = place.homography @ matrix @ points
     return float(np.quantile(np.hypot(*(back[:2] / back[2] - points[:2])), 0.9))
-
-
-def drawn_film(rng: np.random.Generator) -> Film:
-    """One whose changes are like themselves at one place only.
-
-    Of a hundred drawn about one looks alike elsewhere too, when it is right to rely on nothing.
-    """
-    for _ in range(10):
-        film = filmed_swing(int(rng.integers(1_000_000)))
-        place = found(film, film.events, (WIDTH, HEIGHT))
-        if place is not None and place.rival < 0.7 * place.rough:
-            return film
-    raise AssertionError("ten films in a row look alike at two places")
 
 
 @pytest.mark.parametrize("perspective", [0.0, 0.12])
@@ -122,7 +99,7 @@ def test_nothing_is_found_where_nothing_moves_or_no_event_came(rng: np.random.Ge
 
 def test_events_are_gathered_by_pieces_at_times_of_the_frames(rng: np.random.Generator) -> None:
     film = filmed_swing(int(rng.integers(1_000_000)))
-    seen = gathered(film)
+    seen = gathered_changes(film)
     offset = int(rng.integers(-(10**9), 10**9))
     given = replace(film.events, t=film.events.t - offset)
     cuts = [0, *np.sort(rng.integers(0, len(given), 5)).tolist(), len(given)]

@@ -13,7 +13,7 @@ from evsplat.cli import main
 from evsplat.events import EventStream, moved, read_homography, write_events
 from evsplat.importers import import_capture
 
-from ..calibration.film import HEIGHT, WIDTH, Film, drawn_place, filmed_swing, recorded_by
+from ..calibration.film import HEIGHT, WIDTH, Film, drawn_film, drawn_place, recorded_by
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_what_is_found_is_in_the_capture_and_can_be_given_back(
     tmp_path: Path, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
 ) -> None:
     """On a clock that knows nothing of that of the pictures."""
-    film, offset = filmed_swing(int(rng.integers(1_000_000))), int(rng.integers(-(10**9), 10**9))
+    film, offset = drawn_film(rng), int(rng.integers(-(10**9), 10**9))
     matrix, size = drawn_place(rng)
     events = recorded_by(film.events, matrix, size, rng)
     late = replace(events, t=events.t - offset)
@@ -76,7 +76,7 @@ def test_what_is_found_is_in_the_capture_and_can_be_given_back(
 def test_where_nothing_is_certain_nothing_is_written(
     tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    film = filmed_swing(int(rng.integers(1_000_000)))
+    film = drawn_film(rng)
     still = replace(film, pictures=film.pictures[:1] * len(film.pictures))
     matrix, size = drawn_place(rng)
     events = recorded_by(film.events, matrix, size, rng)
