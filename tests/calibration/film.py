@@ -132,7 +132,7 @@ def found(film: Film, events: EventStream, size: tuple[int, int]) -> SensorPlace
 def drawn_film(rng: np.random.Generator) -> Film:
     """One whose changes are like themselves at one place only.
 
-    Of a hundred drawn about one looks alike elsewhere too, when it is right to rely on nothing.
+    Hardly one in a hundred looks alike elsewhere too, when it is right to rely on nothing.
     """
     for _ in range(10):
         film = filmed_swing(int(rng.integers(1_000_000)))
