@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from evsplat.calibration import FramePair, exposure, pair
 from evsplat.calibration.two_sensors import ChangesSeen, SensorPlace, estimate_place
+from evsplat.calibration.ways import WAYS, way_homography
 from evsplat.events import ALWAYS, EventStream
 
 WIDTH, HEIGHT, FRAMES = 96, 80, 9
@@ -99,6 +100,18 @@ def drawn_place(
     lean = np.eye(3)
     lean[2, :2] = perspective / WIDTH * rng.choice([-1, 1], 2)
     return to @ matrix @ lean @ away, size
+
+
+def turned_sensor(
+    matrix: np.ndarray, size: tuple[int, int], way: str
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """As of `drawn_place`, of a sensor that sees it mirrored or turned, one of `WAYS`."""
+    # from the frames to the events is the other way round
+    back = WAYS[way].T
+    turned = size if back[0, 0] else size[::-1]
+    away = way_homography(back, size)
+    away[:2, 2] = (np.array(turned) - 1) / 2 - back @ ((np.array(size) - 1) / 2)
+    return away @ matrix, turned
 
 
 def recorded_by(

@@ -8,7 +8,13 @@ import torch
 
 from evsplat.calibration import offset
 from evsplat.calibration.brightness import level_steps
-from evsplat.calibration.offset import BlockChanges, OffsetEstimate, TooLong, estimate_offset
+from evsplat.calibration.offset import (
+    BlockChanges,
+    OffsetEstimate,
+    TooLong,
+    estimate_offset,
+    offsets_by_correlation,
+)
 from evsplat.events import EventStream, open_recording
 from evsplat.pictures.files import to_unit_range
 
@@ -157,6 +163,20 @@ def test_what_repeats_itself_has_no_certain_offset() -> None:
     estimate = found(seen(light, 20, 20), sent(light))
     assert not estimate.is_certain
     assert estimate.rival == pytest.approx(estimate.correlation, rel=0.05)
+
+
+@pytest.mark.parametrize("period_us", [300_000, 500_000])
+def test_each_period_of_what_repeats_itself_is_likely(period_us) -> None:
+    """And nothing between, which would only be the foot of a peak."""
+    light = logarithms(path(0, 60 * PERIOD_US, period_us=period_us))
+    levels, events, size = seen(light, 20, 20), sent(light), (WIDTH, HEIGHT)
+    likely = offsets_by_correlation(levels, [events], size, 3)
+    assert likely[0] == estimate_offset(levels, [events], size)
+    offsets = np.array([one.offset_us for one in likely])
+    assert np.abs(offsets - period_us * np.round(offsets / period_us)).max() < 3_000
+    assert len({round(offset / period_us) for offset in offsets}) == 3
+    correlations = [one.correlation for one in likely]
+    assert correlations == sorted(correlations, reverse=True)
 
 
 @pytest.mark.parametrize("seed", range(4))

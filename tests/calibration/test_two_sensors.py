@@ -7,7 +7,7 @@ import pytest
 
 from evsplat.calibration.clock import estimate_clock
 from evsplat.calibration.two_sensors import SensorPlace
-from evsplat.calibration.ways import WAYS, way_homography
+from evsplat.calibration.ways import WAYS
 from evsplat.events import EventStream
 
 from .film import (
@@ -22,6 +22,7 @@ from .film import (
     found,
     gathered_changes,
     recorded_by,
+    turned_sensor,
 )
 
 
@@ -58,17 +59,13 @@ def test_scale_turn_shift_and_perspective_are_found_whatever_the_sensors_size(
 
 def test_mirrors_quarter_turns_and_the_other_polarity_are_found(rng: np.random.Generator) -> None:
     film = drawn_film(rng)
-    matrix, size = drawn_place(rng)
     name = str(rng.choice([one for one in WAYS if one]))
-    # from the frames to the events is the other way round
-    turned = size if WAYS[name][0, 0] else size[::-1]
-    away = way_homography(WAYS[name].T, size)
-    away[:2, 2] = (np.array(turned) - 1) / 2 - WAYS[name].T @ ((np.array(size) - 1) / 2)
-    events = recorded_by(film.events, away @ matrix, turned, rng)
-    place = found(film, replace(events, p=-events.p), turned)
+    matrix, size = turned_sensor(*drawn_place(rng), name)
+    events = recorded_by(film.events, matrix, size, rng)
+    place = found(film, replace(events, p=-events.p), size)
     assert place is not None and place.doubt == ""
     assert place.way == name and place.inverted and name in str(place)
-    assert off_px(place, film, away @ matrix) < 0.7 * max(1, WIDTH / size[0])
+    assert off_px(place, film, matrix) < 0.7 * max(1, WIDTH / max(size))
 
 
 def test_events_of_another_scene_or_noise_are_not_relied_on(rng: np.random.Generator) -> None:

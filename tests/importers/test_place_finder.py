@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from evsplat.calibration.ways import WAYS
 from evsplat.capture import Capture, load_capture
 from evsplat.cli import main
 from evsplat.events import EventStream, moved, read_homography, write_events
 from evsplat.importers import import_capture
 
-from ..calibration.film import HEIGHT, WIDTH, Film, drawn_film, drawn_place, recorded_by
+from ..calibration.film import (
+    HEIGHT,
+    WIDTH,
+    Film,
+    drawn_film,
+    drawn_place,
+    recorded_by,
+    turned_sensor,
+)
 
 
 @pytest.fixture
@@ -40,9 +49,9 @@ def all_events(capture: Capture) -> EventStream:
 def test_what_is_found_is_in_the_capture_and_can_be_given_back(
     tmp_path: Path, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """On a clock that knows nothing of that of the pictures."""
+    """Mirrored, turned or neither, on a clock that knows nothing of that of the pictures."""
     film, offset = drawn_film(rng), int(rng.integers(-(10**9), 10**9))
-    matrix, size = drawn_place(rng)
+    matrix, size = turned_sensor(*drawn_place(rng), str(rng.choice(list(WAYS))))
     events = recorded_by(film.events, matrix, size, rng)
     late = replace(events, t=events.t - offset)
     source = written(tmp_path / "rec", film, late, size)
@@ -59,7 +68,7 @@ def test_what_is_found_is_in_the_capture_and_can_be_given_back(
     points = np.stack([film.events.x, film.events.y, np.ones(len(film.events))])
     back = found @ matrix @ points
     off = np.hypot(*(back[:2] / back[2] - points[:2]))
-    assert np.quantile(off, 0.9) < 0.7 * max(1, WIDTH / size[0])
+    assert np.quantile(off, 0.9) < 0.7 * max(1, WIDTH / max(size))
     assert capture.clock_offset_us == pytest.approx(offset, abs=12_000)
     given = import_capture(
         "folder", source, tmp_path / "given", homography=file,

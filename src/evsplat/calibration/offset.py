@@ -4,6 +4,7 @@
 both recorded the same. Frames and events are compared in a coarse grid of blocks, at all offsets.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from evsplat.calibration.brightness import SHORTEST_GAP_US, exposure, level_steps
+from evsplat.calibration.clock import SEARCH_US
 from evsplat.calibration.peak import top_near
 from evsplat.events import EventStream
 from evsplat.pictures.light import Transfer, decode
@@ -99,28 +101,42 @@ def estimate_offset(
     Raises:
         TooLong: The recording is longer than `LONGEST_S`.
     """
+    return next(iter(offsets_by_correlation(frames, events, size, 1)), None)
+
+
+def offsets_by_correlation(
+    frames: BlockChanges, events: Iterable[EventStream], size: tuple[int, int], most: int
+) -> list[OffsetEstimate]:
+    """As of `estimate_offset`, up to ``most`` peaks, the best first.
+
+    They are more than `SEARCH_US` apart, up to which other searches find what is missing.
+    """
     pairs = evenly_spread(range(len(frames.changes)), _MOST_PAIRS)
     if not pairs:
-        return None
+        return []
     spans = np.array(frames.spans_us, dtype=np.int64)[pairs]
     gap_us = float(np.median(spans[:, 1].mean(-1) - spans[:, 0].mean(-1)))
     step_us = max(_LEAST_STEP_US, round(gap_us / _STEPS_PER_GAP))
     level, first_us = _summed(events, size, step_us)
     if not len(level):
-        return None
+        return []
     changes = np.array(frames.changes)[pairs]
     begin_us = int(spans[0, 0, 0])
     starts = np.round((spans[..., 0] - begin_us) / step_us).astype(int)
     exposed = _exposed(level, float(np.median(spans[..., 1] - spans[..., 0])) / step_us)
     first_lag = -int(starts[:, 1].max())
     score = _scores(exposed, changes, starts, first_lag, len(exposed))
-    if not (score > 0).any():
-        return None
-    best = int(np.argmax(score))
-    lag = first_lag + best + _beside(exposed, changes, starts, first_lag + best)
-    return OffsetEstimate(
-        begin_us - first_us - step_us * lag, float(score[best]), _rival(score, best)
-    )
+    around = np.pad(score, 1)
+    left = np.where((score >= around[:-2]) & (score >= around[2:]), score, 0.0)
+    found: list[OffsetEstimate] = []
+    while len(found) < most and (left > 0).any():
+        best = int(np.argmax(left))
+        lag = first_lag + best + _beside(exposed, changes, starts, first_lag + best)
+        offset_us = begin_us - first_us - step_us * lag
+        found.append(OffsetEstimate(offset_us, float(score[best]), _rival(score, best)))
+        near = math.ceil(SEARCH_US / step_us)
+        left[max(0, best - near) : best + near + 1] = 0.0
+    return found
 
 
 def _grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray, int]:

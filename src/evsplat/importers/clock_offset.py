@@ -6,16 +6,21 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
+from evsplat.calibration.clock import SEARCH_US
 from evsplat.calibration.offset import (
     LEAST_CORRELATION,
     BlockChanges,
     OffsetEstimate,
     TooLong,
     estimate_offset,
+    offsets_by_correlation,
 )
-from evsplat.calibration.ways import in_words, way_homography, ways_of
+from evsplat.calibration.ways import WAYS, Way, in_words, way_homography, ways_of
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, moved
+
+_LIKELY = 4
+"""Offsets at most, of which one that is wrong costs a search for the place of the events."""
 
 
 def offset_or_changes(
@@ -29,14 +34,47 @@ def offset_or_changes(
     return BlockChanges(camera.get("transfer", "power"))
 
 
-def likely_offset(
-    changes: BlockChanges, events: Iterable[EventStream], path: Path, size: tuple[int, int]
-) -> OffsetEstimate | None:
-    """`estimate_offset`, which need not be certain; raises where the recording is too long."""
+def likely_offsets(
+    changes: BlockChanges,
+    pieces: Callable[[], Iterable[EventStream]],
+    path: Path,
+    size: tuple[int, int],
+) -> list[int]:
+    """Where the events' clock may be, us, the likeliest first; one where it is certain.
+
+    Whatever way events are mirrored, turned or inverted, of pixels about where those of pictures
+    of ``size`` lie.
+    """
+    found = _offsets(changes, pieces(), path, size, 1)
+    if not (found and found[0].is_certain):
+        for way, inverted in product(WAYS.values(), (False, True)):
+            turned = _turned(pieces(), way, size, inverted=inverted)
+            found += _offsets(changes, turned, path, size, _LIKELY)
+    apart: list[OffsetEstimate] = []
+    for one in sorted(found, key=lambda one: -one.correlation):
+        if all(abs(one.offset_us - other.offset_us) > SEARCH_US for other in apart):
+            apart.append(one)
+    return [round(one.offset_us) for one in apart[:_LIKELY]]
+
+
+def _offsets(
+    changes: BlockChanges,
+    events: Iterable[EventStream],
+    path: Path,
+    size: tuple[int, int],
+    most: int,
+) -> list[OffsetEstimate]:
     try:
-        return estimate_offset(changes, events, size)
+        return offsets_by_correlation(changes, events, size, most)
     except TooLong as error:
         raise DataError(f"{path}: {error}; cut it, or give --clock-offset-us US.") from None
+
+
+def _turned(
+    events: Iterable[EventStream], way: Way, size: tuple[int, int], *, inverted: bool
+) -> Iterable[EventStream]:
+    turned = moved(events, way_homography(way, size), *size)
+    return (replace(piece, p=-piece.p) for piece in turned) if inverted else turned
 
 
 def found_offset(
@@ -51,7 +89,7 @@ def found_offset(
 
     ``one_file``: the pictures are in ``path`` as well.
     """
-    found = likely_offset(changes, pieces(), path, size)
+    found = next(iter(_offsets(changes, pieces(), path, size, 1)), None)
     give = "give --clock-offset-us US, or film more that moves"
     if one_file:
         give = "leave --clock-offset-us out, as a sensor has one clock for both; or " + give
@@ -86,9 +124,7 @@ def _refuse_turned(
     """Raise where events that were mirrored or inverted would have an offset that is certain."""
     found = []
     for (name, way), inverted in product(ways_of(size).items(), (False, True)):
-        turned = moved(pieces(), way_homography(way, size), *size)
-        if inverted:
-            turned = (replace(piece, p=-piece.p) for piece in turned)
+        turned = _turned(pieces(), way, size, inverted=inverted)
         words = in_words(name, inverted=inverted)
         offset = estimate_offset(changes, turned, size) if words else None
         if offset is not None and offset.is_certain:

@@ -16,7 +16,7 @@ from evsplat.errors import DataError
 from evsplat.events import EventRecording, moved
 from evsplat.events.homography import Homography, Mover
 from evsplat.footage import TimedPicture
-from evsplat.importers.clock_offset import likely_offset
+from evsplat.importers.clock_offset import likely_offsets
 from evsplat.pictures.files import to_unit_range
 
 FILE = "events_to_pictures.txt"
@@ -67,14 +67,8 @@ class PlaceFinder:
         Raises:
             DataError: Where they lie is not certain, or they are of the other polarity.
         """
-        path, size = sensor.path, self._seen.size
-        offset_us = clock_offset if isinstance(clock_offset, int) else 0
-        if isinstance(clock_offset, BlockChanges):
-            middle = moved(sensor.chunks(), _as_large(_size(sensor), size), *size)
-            likely = likely_offset(clock_offset, middle, path, size)
-            offset_us = 0 if likely is None else round(likely.offset_us)
-        events = self._seen.events(sensor.chunks(), offset_us)
-        place = estimate_place(self._seen, events, _size(sensor))
+        path = sensor.path
+        place = self._place(sensor, self._offsets(sensor, clock_offset))
         if place is None:
             raise DataError(
                 f"{path}: hardly anything changes in the pictures, or has events, where both were "
@@ -89,7 +83,7 @@ class PlaceFinder:
                 f"the other polarity (correlation {place.correlation:.2f}); write them anew by: "
                 f"{again}"
             )
-        writer.add_homography(FILE, place.homography, size, _certainty(place))
+        writer.add_homography(FILE, place.homography, self._seen.size, _certainty(place))
         lag = ""
         if isinstance(clock_offset, int) and abs(place.lag_us) > MOST_LAG_US:
             lag = f"; they are about {place.lag_us / 1000:.0f} ms late (--clock-offset-us)"
@@ -99,7 +93,38 @@ class PlaceFinder:
             f"{place.error_px:.1f} px where something moves){lag}; the capture holds it as {FILE}, "
             "which --homography takes"
         )
-        return Mover(writer.path / FILE, place.homography, size), [note]
+        return Mover(writer.path / FILE, place.homography, self._seen.size), [note]
+
+    def _offsets(self, sensor: EventRecording, clock_offset: int | BlockChanges) -> list[int]:
+        """Where the clock of the events may be, us, the likeliest first."""
+        if isinstance(clock_offset, int):
+            return [clock_offset]
+        size = self._seen.size
+        matrix = _as_large(_size(sensor), size)
+        return likely_offsets(
+            clock_offset, lambda: moved(sensor.chunks(), matrix, *size), sensor.path, size
+        )
+
+    def _place(self, sensor: EventRecording, offsets_us: Sequence[int]) -> SensorPlace | None:
+        """By the first of the clocks that leaves no doubt; else by that which fits best.
+
+        Of what swings, a clock that is off by half a period says the other polarity.
+        """
+        best: SensorPlace | None = None
+        for offset_us in offsets_us:
+            events = self._seen.events(sensor.chunks(), offset_us)
+            place = estimate_place(self._seen, events, _size(sensor))
+            if place is None:
+                continue
+            if not place.doubt and not place.inverted:
+                return place
+            if best is None or _rank(place) > _rank(best):
+                best = place
+        return best
+
+
+def _rank(place: SensorPlace) -> tuple[bool, float]:
+    return not place.doubt, place.correlation
 
 
 def _size(sensor: EventRecording) -> tuple[int, int]:
