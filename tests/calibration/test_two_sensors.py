@@ -84,6 +84,18 @@ def test_events_of_another_scene_or_noise_are_not_relied_on(rng: np.random.Gener
     assert place is None or "nowhere" in place.doubt
 
 
+def test_events_of_less_than_six_changes_are_not_relied_on(rng: np.random.Generator) -> None:
+    film = drawn_film(rng)
+    matrix, size = drawn_place(rng)
+    events = recorded_by(film.events, matrix, size, rng)
+    begin = int(rng.integers(FRAMES - 4)) * PERIOD_US
+    part = events.take((events.t >= begin) & (events.t < begin + 4 * PERIOD_US))
+    place = found(film, part, size)
+    assert place is not None and place.doubt
+    agreeing = replace(place, correlation=1.0, rival=0.0, halves_agree=True, lag_us=0.0)
+    assert "too few of the pictures' changes" in agreeing.doubt
+
+
 def test_nothing_is_found_where_nothing_moves_or_no_event_came(rng: np.random.Generator) -> None:
     film = filmed_swing(int(rng.integers(1_000_000)))
     still = replace(film, pictures=film.pictures[:1] * FRAMES)

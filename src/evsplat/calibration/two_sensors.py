@@ -60,7 +60,7 @@ class SensorPlace:
     halves_agree: bool
     """Whether each half of the pairs leads to the same place."""
     error_px: float
-    """Standard error where something moves, in pixels of the pictures."""
+    """Standard error where something moves, in pixels of the pictures; infinite where few tell."""
     lag_us: float
     """How much later than the frames events are stamped."""
     size_px: tuple[int, int]
@@ -82,9 +82,10 @@ class SensorPlace:
             return f"agree with halves of the pictures' changes at two places {fit})"
         if abs(self.lag_us) >= SEARCH_US:
             return f"have a clock that is off by {SEARCH_US / 1000:g} ms or more"
+        if not math.isfinite(self.error_px):
+            return f"are there for too few of the pictures' changes to tell where they lie {fit})"
         if not self.error_px <= MOST_ERROR * max(self.size_px):
-            px = f"{self.error_px:.1f} px" if math.isfinite(self.error_px) else "nothing"
-            return f"tell where they belong to {px} only, as too little moves"
+            return f"tell where they belong to {self.error_px:.1f} px only, as too little moves"
         return ""
 
     def __str__(self) -> str:
