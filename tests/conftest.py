@@ -40,6 +40,11 @@ CONTRAST = 0.2
 PERIOD_US, EXPOSURE_US, SUBFRAMES = 40_000, 30_000, 8
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """What a test drew that failed is drawn again."""
+    parser.addoption("--seed", type=int, help="of the numbers that tests draw anew in each run")
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Workers import different test modules first, so that each is made ready once, for all.
 
@@ -102,6 +107,16 @@ def demo_capture_path() -> Path:
 def body() -> Body:
     """The body that ships, of middling shape."""
     return default_body()
+
+
+@pytest.fixture
+def rng(pytestconfig: pytest.Config) -> np.random.Generator:
+    """Of a seed that no two runs share; pytest shows it where a test fails."""
+    seed = pytestconfig.getoption("--seed")
+    if seed is None:
+        seed = int(np.random.default_rng().integers(1 << 31))
+    print(f"drawn by seed {seed}: pytest --seed {seed} draws the same")
+    return np.random.default_rng(seed)
 
 
 @pytest.fixture

@@ -53,8 +53,7 @@ def test_quaternion_product_composes_right_first():
     assert torch.allclose(quaternion_to_matrix(3.7 * product), quaternion_to_matrix(product))
 
 
-def test_poses_in_degrees_are_told_from_those_that_go_round():
-    rng = np.random.default_rng()
+def test_poses_in_degrees_are_told_from_those_that_go_round(rng: np.random.Generator):
     poses = 0.5 * rng.normal(size=(40, 24, 3))
     poses[:, 0, 2] += np.linspace(0, 60, 40)  # a pirouette
     poses[:, 16] = np.linspace(0, 3 * np.pi, 40)[:, None] * (0.6, 0.0, 0.8)

@@ -38,8 +38,8 @@ def test_track_equals_scipy_splines_between_uneven_keys(seed):
     assert np.abs(transl.numpy() - CubicSpline(seconds, places)(at)).max() < 1e-6
 
 
-def test_vertices_at_many_times_are_blended_bones_of_each():
-    seed = int(np.random.default_rng().integers(10_000))
+def test_vertices_at_many_times_are_blended_bones_of_each(rng: np.random.Generator):
+    seed = int(rng.integers(10_000))
     track, _, _ = make_track(seed, keys=5)
     rng = np.random.default_rng(seed)
     times = rng.integers(track.times_us[0] - 5_000, track.times_us[-1] + 5_000, 7).tolist()

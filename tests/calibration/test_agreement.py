@@ -45,8 +45,8 @@ def _changed(events: EventStream, **columns: np.ndarray) -> EventStream:
     ],
 )
 @pytest.mark.parametrize("inverted", [False, True])
-def test_what_events_went_through_is_found(turned, flip_x, flip_y, inverted) -> None:
-    seed = int(np.random.default_rng().integers(10_000))
+def test_what_events_went_through_is_found(rng, turned, flip_x, flip_y, inverted) -> None:
+    seed = int(rng.integers(10_000))
     recording = record(seed, plus=0.2, minus=0.25, lag_us=6_000, noise_hz=0.5)
     given = recording.events
     events = _changed(
@@ -75,10 +75,10 @@ def test_what_events_went_through_is_found(turned, flip_x, flip_y, inverted) -> 
     ],
 )
 def test_quarter_turns_are_told_of_square_pictures_by_what_takes_them_back(
-    turned, quarters, mirrored
+    rng: np.random.Generator, turned, quarters, mirrored
 ) -> None:
     """NumPy says which way: each event's pixel is followed through ``rot90`` by its number."""
-    recording = record(int(np.random.default_rng().integers(10_000)), plus=0.2, minus=0.2)
+    recording = record(int(rng.integers(10_000)), plus=0.2, minus=0.2)
     side = HEIGHT
     pairs = [
         replace(pair, change=pair.change[:, :side], usable=pair.usable[:, :side])
@@ -109,8 +109,8 @@ def _without(recording: Recording, start_us: int, end_us: int) -> EventStream:
     return recording.events.take((t < start_us) | (t >= end_us))
 
 
-def test_a_gap_in_the_events_is_found_where_it_is() -> None:
-    seed = int(np.random.default_rng().integers(10_000))
+def test_a_gap_in_the_events_is_found_where_it_is(rng: np.random.Generator) -> None:
+    seed = int(rng.integers(10_000))
     recording = record(seed, plus=0.2, minus=0.2)
     assert find_lost(recording.pairs, recording.events) == Lost()
     # frames are 40 ms apart: those of 200.5 to 280.5 and 280.5 to 320.5 ms saw no event
@@ -119,9 +119,9 @@ def test_a_gap_in_the_events_is_found_where_it_is() -> None:
 
 
 def test_of_lost_events_all_the_silence_tells_nothing_across_held_out_intervals_too(
+    rng: np.random.Generator,
     tmp_path: Path,
 ) -> None:
-    rng = np.random.default_rng()
     recording = record(int(rng.integers(10_000)), plus=0.2, minus=0.2)
     start, end = int(rng.integers(130_000, 200_000)), int(rng.integers(430_000, 500_000))
     rest, readable = _without(recording, start, end), [(ALWAYS[0], 220_000), (300_000, ALWAYS[1])]
@@ -144,9 +144,11 @@ def _stored(events: EventStream, path: Path, readable_us: list[Span]) -> EventSt
 
 
 @pytest.mark.parametrize("noise", [0, 40])
-def test_a_pause_is_seen_among_more_frames_than_anybody_reads(tmp_path: Path, noise: int) -> None:
+def test_a_pause_is_seen_among_more_frames_than_anybody_reads(
+    rng: np.random.Generator, tmp_path: Path, noise: int
+) -> None:
     """Of a stall the frames about it; of rest, which comes slowly, some, however often it comes."""
-    rng, count, period = np.random.default_rng(), 6_000, 40_000
+    count, period = 6_000, 40_000
     spans = [(k * period, k * period + 10_000) for k in range(count)]
     # Somebody who rests for some frames time and again.
     usual = 200 * np.clip(1.5 * np.sin(np.arange(count) / rng.uniform(14, 18)), 0, 1)
@@ -185,10 +187,9 @@ def test_no_gap_is_told_where_nothing_moves_or_nothing_was_recorded() -> None:
 @pytest.mark.parametrize("backwards", [False, True], ids=["early", "late"])
 @pytest.mark.parametrize("draw", range(2))
 def test_a_recorder_that_ends_early_or_begins_late_is_told_from_who_stands_still(
-    tmp_path: Path, draw: int, backwards: bool
+    rng: np.random.Generator, tmp_path: Path, draw: int, backwards: bool
 ) -> None:
     """Late is early with time running backwards: events change sign, pairs their frames."""
-    rng = np.random.default_rng()
     seed, frames, exposure_us = rng.integers(10_000), 20, int(rng.integers(500, 35_000))
     plus, minus = rng.uniform(0.1, 0.35, 2)
     end = frames * 40_000
@@ -226,8 +227,8 @@ def _backwards(pair: FramePair, end_us: int) -> FramePair:
     return FramePair(before, after, -pair.change, pair.usable, ALWAYS)
 
 
-def test_events_that_lie_in_other_pixels_are_told_from_lost_ones() -> None:
-    seed = int(np.random.default_rng().integers(10_000))
+def test_events_that_lie_in_other_pixels_are_told_from_lost_ones(rng: np.random.Generator) -> None:
+    seed = int(rng.integers(10_000))
     recording = record(seed, plus=0.2, minus=0.2, still_rows=HEIGHT // 2, noise_hz=1.0)
     assert not find_lost(recording.pairs, recording.events).elsewhere
     # Where nothing moves in the pictures.
@@ -243,14 +244,14 @@ def test_events_that_lie_in_other_pixels_are_told_from_lost_ones() -> None:
 
 
 @pytest.mark.parametrize("lag_us", [0, 15_000])
-def test_pixels_that_change_very_much_have_events_unless_the_sensor_is_coarser(lag_us) -> None:
+def test_pixels_that_change_very_much_have_events_unless_the_sensor_is_coarser(rng, lag_us) -> None:
     """As of a sensor with a third of the pixels' columns and rows, warped to the frames.
 
     How many of the few pixels that change so much lie on them varies by 0.03 from one recording to
     the next: in the mean of six by 0.012.
     """
     off = []
-    for seed in np.random.default_rng().integers(10_000, size=6):
+    for seed in rng.integers(10_000, size=6):
         recording = record(int(seed), plus=0.35, minus=0.4, lag_us=lag_us, noise_hz=1.0)
         share = answered_share(recording.pairs, recording.events)
         assert share is not None and share > 0.85

@@ -37,10 +37,11 @@ def exposed(before_us: Span, after_us: Span, recorded_us: Span) -> FramePair:
 
 
 @pytest.mark.parametrize("step", [1, 5])
-def test_levels_are_told_without_lag_when_a_change_turns(step: int) -> None:
+def test_levels_are_told_without_lag_when_a_change_turns(
+    rng: np.random.Generator, step: int
+) -> None:
     # polarities alone would say a whole threshold too much: half of what is left above the last
     # event while it rises, and below it while it falls
-    rng = np.random.default_rng()
     late_us = int(rng.integers(-50_000, 50_000))
     events = recorded(int(rng.integers(1_000_000)), late_us=late_us)
     # from two thresholds after a turn on, when every pixel has said so

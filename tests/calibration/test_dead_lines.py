@@ -26,9 +26,9 @@ def _sweep(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     return counts
 
 
-def test_dead_lines_are_found_and_no_others() -> None:
+def test_dead_lines_are_found_and_no_others(rng: np.random.Generator) -> None:
     """Nor beside hot pixels, where nothing moves."""
-    for seed in np.random.default_rng().integers(1_000_000, size=50):
+    for seed in rng.integers(1_000_000, size=50):
         rng = np.random.default_rng(seed)
         counts = _sweep(rng, 60, 80)
         hot = rng.integers(0, counts.size, 40)
@@ -65,8 +65,10 @@ def test_lines_without_events_for_other_reasons_are_not_dead(counts: np.ndarray)
     assert dead_rows(counts) == []
 
 
-def test_inspect_tells_dead_lines_of_captures_and_recordings(tiny_capture, tmp_path: Path) -> None:
-    rng, path = np.random.default_rng(), tiny_capture(frames=12)
+def test_inspect_tells_dead_lines_of_captures_and_recordings(
+    rng: np.random.Generator, tiny_capture, tmp_path: Path
+) -> None:
+    path = tiny_capture(frames=12)
     count, row = 60_000, int(rng.integers(3, 20))
     t = np.sort(rng.integers(0, 440_000, count))
     x, y, p = (rng.integers(0, most, count) for most in (32, 24, 2))

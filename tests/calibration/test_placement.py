@@ -31,8 +31,8 @@ def moved(
 
 
 @pytest.fixture(params=range(3))
-def seed(request: pytest.FixtureRequest) -> int:
-    return int(np.random.default_rng().integers(1_000_000))
+def seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1_000_000))
 
 
 def test_events_in_their_place_are_not_told_whatever_the_clock_and_the_noise(seed: int) -> None:

@@ -26,11 +26,6 @@ from .film import (
 )
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(int(np.random.default_rng().integers(1_000_000)))
-
-
 def off_px(place: SensorPlace, film: Film, matrix: np.ndarray) -> float:
     """Of where events of the film belong, how far from there most of them are put."""
     points = np.stack([film.events.x, film.events.y, np.ones(len(film.events))])

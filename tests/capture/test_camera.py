@@ -48,8 +48,10 @@ def test_projection_agrees_with_opencv(seed: int) -> None:
 
 
 @pytest.mark.parametrize("step", [1, 2, 5, 7])
-def test_a_smaller_camera_sees_points_in_the_squares_of_pixels_that_they_were_in(step: int) -> None:
-    camera = random_camera(int(np.random.default_rng().integers(1000)))
+def test_a_smaller_camera_sees_points_in_the_squares_of_pixels_that_they_were_in(
+    rng: np.random.Generator, step: int
+) -> None:
+    camera = random_camera(int(rng.integers(1000)))
     in_camera = torch.tensor([[0.3, -0.2, 2.0], [-0.4, 0.1, 1.5]])
     pose = camera.world_to_camera
     points = (in_camera - pose[:3, 3]) @ pose[:3, :3]

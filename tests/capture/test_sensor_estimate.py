@@ -109,10 +109,9 @@ def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_stall_between_the_pairs_that_are_compared_is_found_once(
-    tiny_capture: Factory, few_pairs, monkeypatch
+    rng: np.random.Generator, tiny_capture: Factory, few_pairs, monkeypatch
 ) -> None:
     # Frames are 40 ms apart; those of 10 to 16 and 20 to 26 train.
-    rng = np.random.default_rng()
     drawn = (
         (tiny_capture(str(seed), frames=30, width=96, height=72, seed=int(seed)), int(first))
         for seed, first in zip(
@@ -141,9 +140,10 @@ def test_a_stall_between_the_pairs_that_are_compared_is_found_once(
 
 
 @pytest.mark.parametrize("levels", [0, 3])
-def test_nothing_is_lost_while_nobody_moves(tiny_capture: Factory, few_pairs, levels: int) -> None:
+def test_nothing_is_lost_while_nobody_moves(
+    rng: np.random.Generator, tiny_capture: Factory, few_pairs, levels: int
+) -> None:
     """Pictures of one moment with no event between them, with noise of some levels of 255."""
-    rng = np.random.default_rng()
     path = tiny_capture(frames=30, width=64, height=48, seed=int(rng.integers(10_000)))
     for low, high in ((1, 5), (10, 16), (21, 24)):
         still = read_image(path / f"images/{low:04d}.png").astype(np.float64)

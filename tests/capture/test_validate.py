@@ -390,10 +390,11 @@ def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
 
 
 def test_exposures_as_long_as_the_interval_do_not_overlap_by_rounding(
+    rng: np.random.Generator,
     tiny_capture: Factory,
 ) -> None:
     path = tiny_capture()
-    fps = np.random.default_rng().uniform(20, 60)
+    fps = rng.uniform(20, 60)
     document = json.loads((path / "capture.json").read_text())
     shift = document["frames"][0]["exposure_us"][0]
     for index, frame in enumerate(document["frames"]):
@@ -837,7 +838,7 @@ def test_no_test_frame_says_how_to_have_one(tiny_capture: Factory) -> None:
 @pytest.mark.parametrize("end", ["first", "last"])
 @pytest.mark.parametrize("noise", [0, 2])
 def test_a_sensor_that_is_silent_while_nothing_moves_is_no_fault(
-    tiny_capture: Factory, end: str, noise: int
+    rng: np.random.Generator, tiny_capture: Factory, end: str, noise: int
 ) -> None:
     """Somebody enters in the fifth frame, or left before it; the camera has noise or has none.
 
@@ -850,7 +851,6 @@ def test_a_sensor_that_is_silent_while_nothing_moves_is_no_fault(
     kept = t >= 160_000 if end == "first" else t < 160_000
     write_event_file(path / "events.h5", *(column[kept] for column in (t, x, y, p)))
     check(the_only(path, "warning"), path / "events.h5", "events/t", "events from", "over 0..")
-    rng = np.random.default_rng()
     empty = read_image(path / "images" / f"{still[0]:04d}.png").astype(int)
     for index in still:
         picture = empty + rng.normal(0, noise, empty.shape).round().astype(int)

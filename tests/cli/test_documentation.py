@@ -38,8 +38,8 @@ def test_readme_commands_have_only_known_options(arguments, capsys, tmp_path, mo
     assert "Unrecognized" not in stderr
 
 
-def test_events_of_another_sensor_are_moved_as_the_guide_says(tmp_path, monkeypatch):
-    seed = int(np.random.default_rng().integers(10_000))
+def test_events_of_another_sensor_are_moved_as_the_guide_says(rng, tmp_path, monkeypatch):
+    seed = int(rng.integers(10_000))
     rng = np.random.default_rng(seed)
     x, y = rng.integers(0, 1280, 3_000), rng.integers(0, 720, 3_000)
     stream = EventStream(

@@ -73,11 +73,13 @@ def test_parts_are_black_where_nothing_is_known_to_be_the_person(tiny_capture):
     assert person.rgb.abs().max() == 0 and person.alpha.max() == 0
 
 
-def test_a_median_of_large_pictures_takes_no_more_memory_than_it_may(tiny_capture, monkeypatch):
+def test_a_median_of_large_pictures_takes_no_more_memory_than_it_may(
+    rng, tiny_capture, monkeypatch
+):
     """255 pictures of 4k would be 6 GB; so many are taken, evenly spread, that the limit holds."""
     monkeypatch.setattr("evsplat.capture.read._LEAST_MEDIAN_FRAMES", 1)
     monkeypatch.setattr("evsplat.capture.read._MEDIAN_BYTES", 5 * 24 * 32 * 3 + 7)
-    capture = load_capture(tiny_capture(frames=20, seed=int(np.random.default_rng().integers(99))))
+    capture = load_capture(tiny_capture(frames=20, seed=int(rng.integers(99))))
     train = capture.train_frames
     frames = [train[round(k * (len(train) - 1) / 4)] for k in range(5)]
     stack = np.stack([np.array(Image.open(frame.image)) for frame in frames])

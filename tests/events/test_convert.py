@@ -107,9 +107,9 @@ def test_command_converts_repairs_and_says_what_it_did(
 
 
 def test_polarities_are_exchanged_where_there_are_any(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rng: np.random.Generator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    s = random_stream(int(np.random.default_rng().integers(1_000)), 2_000)
+    s = random_stream(int(rng.integers(1_000)), 2_000)
     write_events(tmp_path / "e.raw", s, width=WIDTH, height=HEIGHT)
     for source, out, p in (("e.raw", "other.csv", -s.p), ("other.csv", "again.h5", s.p)):
         assert main(["convert", str(tmp_path / source), str(tmp_path / out), "--invert"]) == 0
@@ -121,9 +121,9 @@ def test_polarities_are_exchanged_where_there_are_any(
 
 
 def test_a_recording_is_not_converted_onto_itself_unless_that_is_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rng: np.random.Generator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    s = random_stream(int(np.random.default_rng().integers(1_000)), 3_000)
+    s = random_stream(int(rng.integers(1_000)), 3_000)
     for name in ("e.npz", "e.h5", "e.csv", "e.raw"):
         path = tmp_path / name
         write_events(path, s)

@@ -25,8 +25,9 @@ from .formats.helpers import HEIGHT, WIDTH, random_stream, same
 
 
 @pytest.fixture(params=range(3))
-def rng(request: pytest.FixtureRequest) -> np.random.Generator:
-    return np.random.default_rng(int(np.random.default_rng().integers(1_000_000)))
+def rng(rng: np.random.Generator) -> np.random.Generator:
+    """Three draws."""
+    return rng
 
 
 def drawn(rng: np.random.Generator, count: int = 4_000) -> EventStream:

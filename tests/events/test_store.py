@@ -56,11 +56,10 @@ def test_what_was_decoded_is_not_looked_up_again(tmp_path: Path, monkeypatch) ->
 
 @pytest.mark.parametrize("piece", [3, 1 << 20])
 def test_counts_are_those_of_the_milliseconds_that_may_be_read(
-    tmp_path, monkeypatch, piece
+    rng: np.random.Generator, tmp_path, monkeypatch, piece
 ) -> None:
     """Against brute force, with clocks apart by any number of microseconds."""
     monkeypatch.setattr(store_module, "INDEX_PIECE", piece)
-    rng = np.random.default_rng()
     events, offset = random_events(int(rng.integers(10_000)), 800, 60_000), int(rng.integers(5_000))
     write_events(tmp_path / "events.h5", events)
     readable = [(ALWAYS[0], 15_200), (20_700, 40_100), (47_300, ALWAYS[1])]

@@ -159,8 +159,8 @@ def test_a_background_that_is_clear_in_places_is_refused(tmp_path, kind):
 
 
 @pytest.mark.parametrize("colour", [False, True])
-def test_a_background_of_16_bits_is_as_bright_as_its_values_say(tmp_path, recorded, colour):
-    values = np.random.default_rng().integers(0, 65_536, (64, 96, 3)[: 2 + colour], dtype=np.uint16)
+def test_a_background_of_16_bits_is_as_bright_as_its_values_say(rng, tmp_path, recorded, colour):
+    values = rng.integers(0, 65_536, (64, 96, 3)[: 2 + colour], dtype=np.uint16)
     write_image(tmp_path / "a.png", values)
     shown = Painted.of(str(tmp_path / "a.png")).behind(camera_before(recorded), 0)
     expected = torch.from_numpy(values / 65_535).float()

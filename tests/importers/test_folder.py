@@ -114,10 +114,10 @@ def test_exposures_of_a_list_and_pictures_without_a_pose(
 
 
 def test_a_part_of_the_pictures_has_their_poses_masks_and_events(
-    recording: Path, tmp_path: Path, monkeypatch
+    rng: np.random.Generator, recording: Path, tmp_path: Path, monkeypatch
 ) -> None:
     models = write_smpl(tmp_path / "models")
-    first = int(np.random.default_rng().integers(1, COUNT - 2))
+    first = int(rng.integers(1, COUNT - 2))
     options = {"fps": 25.0, "exposure_us": 30_000.0, "start_us": 16_000}
     frames = (first, first + 2)
     import_capture("folder", recording, tmp_path / "out", smpl=models, frames=frames, **options)
@@ -135,10 +135,10 @@ def test_a_part_of_the_pictures_has_their_poses_masks_and_events(
 
 
 def test_a_recording_is_made_smaller_with_its_camera_masks_and_events(
-    recording: Path, tmp_path: Path, monkeypatch
+    rng: np.random.Generator, recording: Path, tmp_path: Path, monkeypatch
 ) -> None:
     models = write_smpl(tmp_path / "models")
-    factor = int(np.random.default_rng().integers(2, 5))
+    factor = int(rng.integers(2, 5))
     wide, high = 128 // factor, 136 // factor
     options = {"fps": 25.0, "exposure_us": 30_000.0, "start_us": 16_000, "contrast": (0.4, 0.2)}
     import_capture("folder", recording, tmp_path / "out", smpl=models, shrink=factor, **options)
@@ -168,7 +168,7 @@ def test_a_recording_is_made_smaller_with_its_camera_masks_and_events(
 
 @pytest.mark.parametrize("held", ["level", "on end"])
 def test_events_of_a_finer_sensor_are_moved_into_the_pictures_before_they_are_made_smaller(
-    recording: Path, tmp_path: Path, held: str
+    rng: np.random.Generator, recording: Path, tmp_path: Path, held: str
 ) -> None:
     """Those are upright, as of a camera that was held on end and whose files say so."""
     if held == "on end":
@@ -178,7 +178,6 @@ def test_events_of_a_finer_sensor_are_moved_into_the_pictures_before_they_are_ma
             turned = Image.fromarray(np.rot90(np.array(Image.open(path))))
             turned.save(path.with_suffix(".jpg"), exif=exif)
             path.unlink()
-    rng = np.random.default_rng()
     scale, right, down = rng.uniform(1.2, 1.6), *rng.uniform(-6, 6, 2)
     away = np.array([[scale, 0, right], [0, scale, down], [0, 0, 1]])
     rows = np.loadtxt(recording / "events.csv", delimiter=",", skiprows=1).astype(int)

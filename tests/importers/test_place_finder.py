@@ -25,11 +25,6 @@ from ..calibration.film import (
 )
 
 
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(int(np.random.default_rng().integers(1_000_000)))
-
-
 def written(folder: Path, film: Film, events: EventStream | None, size: tuple[int, int]) -> Path:
     (folder / "images").mkdir(parents=True)
     for index, picture in enumerate(film.pictures):

@@ -195,11 +195,11 @@ def test_the_offset_of_the_events_clock_is_found(tmp_path: Path) -> None:
 
 
 def test_a_davis_whose_events_have_a_clock_of_their_own_is_brought_onto_that_of_its_frames(
+    rng: np.random.Generator,
     tmp_path: Path,
 ) -> None:
     """Whichever way the offset comes, found or given, and wherever the clocks begin."""
     path = tmp_path / "dance.aedat4"
-    rng = np.random.default_rng()
     begin_us = EPOCH_US + int(rng.integers(1_000_000))
     # by more than the recording is long, so that none is at the time of a picture
     ahead_us = int(rng.choice([-1, 1]) * rng.integers(1_000_000, 5_000_000))
@@ -313,13 +313,14 @@ def test_a_video_with_events_beside_it(tmp_path: Path) -> None:
 
 
 def test_a_mirrored_sensor_is_brought_into_the_video_and_its_clock_is_found_there(
+    rng: np.random.Generator,
     tmp_path: Path,
 ) -> None:
     """As behind a beam splitter, where events as they are agree at no offset."""
     clip, events = tmp_path / "clip.mp4", tmp_path / "events.h5"
     write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
     given = events_of_the_bar(3_000_000)
-    right = int(np.random.default_rng().integers(0, 30))
+    right = int(rng.integers(0, 30))
     x = WIDTH - 1 - given.x + right
     write_events(events, replace(given, x=x.astype(np.uint16)), width=90, height=HEIGHT)
     np.savetxt(tmp_path / "H.txt", [[-1, 0, WIDTH - 1 + right], [0, 1, 0], [0, 0, 1]])
@@ -333,12 +334,14 @@ def test_a_mirrored_sensor_is_brought_into_the_video_and_its_clock_is_found_ther
     assert np.array_equal(found.x, inside.x // 2) and np.array_equal(found.p, inside.p)
 
 
-def test_a_part_of_a_video_keeps_its_clock_and_the_events_of_its_time(tmp_path: Path) -> None:
+def test_a_part_of_a_video_keeps_its_clock_and_the_events_of_its_time(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
     clip, given = tmp_path / "clip.mp4", some_events(500)
     write_video(clip, [np.repeat(p[..., None], 3, axis=2) for p in moving_bar()], fps=25)
     write_events(tmp_path / "events.h5", given)
     options = {"events": tmp_path / "events.h5", "exposure_us": 20_000.0, "clock_offset_us": -500}
-    first, stop = sorted(np.random.default_rng().choice(COUNT, 2, replace=False).tolist())
+    first, stop = sorted(rng.choice(COUNT, 2, replace=False).tolist())
     part = run("video", clip, tmp_path / "part", frames=(first, stop), **options)
     whole = run("video", clip, tmp_path / "whole", **options)
     assert [frame.name for frame in part.frames] == [f"{i:06d}" for i in range(first, stop)]
@@ -357,8 +360,9 @@ def test_a_part_of_a_video_keeps_its_clock_and_the_events_of_its_time(tmp_path: 
     assert not (tmp_path / "none").exists()
 
 
-def test_of_large_pictures_the_least_factor_that_leaves_few_pixels_is_told() -> None:
-    rng = np.random.default_rng()
+def test_of_large_pictures_the_least_factor_that_leaves_few_pixels_is_told(
+    rng: np.random.Generator,
+) -> None:
     for width, height in rng.integers(1300, 8000, (20, 2)).tolist():
         (note,) = large_pictures((width, height))
         factor = int(note.split("--shrink ")[1].split()[0])

@@ -329,7 +329,7 @@ def test_given_thresholds_that_are_not_the_fitted_are_told(
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("wrong", ["shifted", "turned", "inverted", "turned and inverted"])
 def test_what_is_told_to_type_brings_events_into_the_pixels_of_the_pictures(
-    tiny_capture: Factory, tmp_path: Path, wrong: str
+    rng: np.random.Generator, tiny_capture: Factory, tmp_path: Path, wrong: str
 ) -> None:
     def of_events(findings: tuple[Finding, ...]) -> list[Finding]:
         return [finding for finding in findings if finding.file.suffix == ".h5"]
@@ -338,7 +338,7 @@ def test_what_is_told_to_type_brings_events_into_the_pixels_of_the_pictures(
     found = out / "events_to_pictures.txt"
     with h5py.File(path / "events.h5") as file:
         t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
-    right = int(np.random.default_rng().integers(4, 8)) if wrong == "shifted" else 0
+    right = int(rng.integers(4, 8)) if wrong == "shifted" else 0
     kept = x + right < 64
     t, x, y, p = (column[kept] for column in (t, x, y, p))
     of_file = [t, x + right, y, 1 - p if "inverted" in wrong else p]

@@ -42,12 +42,13 @@ def test_events_warped_to_half_the_size_are_not_called_lost(
 
 
 def test_events_beside_their_pixels_are_told_by_how_far_and_not_as_another_fault(
+    rng: np.random.Generator,
     tiny_capture: Callable[..., Path],
 ) -> None:
     path = tiny_capture(frames=12, width=64, height=48)
     with h5py.File(path / "events.h5") as file:
         t, x, y, p = (file[f"events/{key}"][:] for key in "txyp")
-    right = int(np.random.default_rng().integers(4, 8))
+    right = int(rng.integers(4, 8))
     kept = x + right < 64
     write_event_file(path / "events.h5", t[kept], x[kept] + right, y[kept], p[kept])
     (finding,) = event_findings(seen(path))
@@ -58,12 +59,13 @@ def test_events_beside_their_pixels_are_told_by_how_far_and_not_as_another_fault
 
 
 def test_of_events_without_polarity_is_told_what_needs_none(
+    rng: np.random.Generator,
     tiny_capture: Callable[..., Path],
 ) -> None:
     """That the sensor lost some, and that they lie elsewhere; not which way, which they hide."""
     drawn = (
         tiny_capture(str(seed), frames=12, width=96, height=72, seed=int(seed))
-        for seed in np.random.default_rng().integers(10_000, size=300)
+        for seed in rng.integers(10_000, size=300)
     )
     path = next(one for one in drawn if changes_much(one, 5, 6))
     with h5py.File(path / "events.h5") as file:

@@ -10,9 +10,8 @@ from evsplat.inspection.figure import Coarse, Figure
 
 
 def test_gaps_are_closed_as_scipy_closes_them_and_times_are_drawn_alike_together(
-    tiny_capture, monkeypatch
+    rng: np.random.Generator, tiny_capture, monkeypatch
 ):
-    rng = np.random.default_rng()
     capture = load_capture(tiny_capture(seed=int(rng.integers(10_000))))
     figure = Figure(load_body_track(capture))
     camera = capture.camera(capture.frames[0])

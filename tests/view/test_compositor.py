@@ -19,8 +19,8 @@ LABEL = 30
 
 
 @pytest.fixture(name="capture")
-def _capture(tiny_capture) -> Capture:
-    return load_capture(tiny_capture(seed=int(np.random.default_rng().integers(1_000_000))))
+def _capture(tiny_capture, rng) -> Capture:
+    return load_capture(tiny_capture(seed=int(rng.integers(1_000_000))))
 
 
 class _Painted:

@@ -33,9 +33,9 @@ DEFORMED = {
 
 
 @pytest.fixture(name="run", params=DEFORMED)
-def _run(tiny_capture, request):
+def _run(tiny_capture, request, rng):
     """A run of a method whose networks say something."""
-    torch.manual_seed(int(np.random.default_rng().integers(1 << 31)))
+    torch.manual_seed(int(rng.integers(1 << 31)))
     method, capture = request.param, load_capture(tiny_capture())
     config = small_config(method, *DEFORMED[method])
     model = built(method, capture, *DEFORMED[method]).model

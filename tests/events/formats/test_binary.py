@@ -212,10 +212,10 @@ def test_cut_file_is_an_error_or_kept_up_to_the_cut(tmp_path: Path, name: str) -
 @pytest.mark.parametrize("repair", [False, True])
 @pytest.mark.parametrize("name", ENCODERS)
 def test_two_recordings_in_one_file_are_refused_where_the_second_begins(
-    tmp_path: Path, name: str, repair: bool
+    rng: np.random.Generator, tmp_path: Path, name: str, repair: bool
 ) -> None:
     """Its header was read as events, with words shifted behind it, or it was passed over."""
-    seed = int(np.random.default_rng().integers(1 << 31))
+    seed = int(rng.integers(1 << 31))
     encode = ENCODERS[name][1]
     first = encode(random_stream(seed, 4000, first_us=1000))
     second = encode(random_stream(seed + 1, 4000, first_us=500_000))
@@ -238,9 +238,11 @@ def test_a_first_recording_may_end_in_the_bytes_that_headers_begin_with(tmp_path
         read_events(tmp_path / "both")
 
 
-def test_a_second_recording_behind_the_table_of_packets_is_refused(tmp_path: Path) -> None:
+def test_a_second_recording_behind_the_table_of_packets_is_refused(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
     """An AEDAT4 file that was closed says where its packets end; the rest was passed over."""
-    s = random_stream(int(np.random.default_rng().integers(1 << 31)), 3000)
+    s = random_stream(int(rng.integers(1 << 31)), 3000)
     one = encoders.aedat4(s, WIDTH, HEIGHT)
     closed = encoders.aedat4(s, WIDTH, HEIGHT, table_at=len(one)) + b"FTAB, any bytes" * 9
     path = tmp_path / "closed"

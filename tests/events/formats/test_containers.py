@@ -152,12 +152,14 @@ assert np.array_equal(events.t, rows["t"]) and np.array_equal(events.x, rows["x"
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_a_file_packed_with_ecf_is_read_where_its_plug_in_is(tmp_path: Path) -> None:
+def test_a_file_packed_with_ecf_is_read_where_its_plug_in_is(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
     """A plug-in of that number turns bits of each byte; what it is told to unpack comes out."""
     (tmp_path / "ecf.c").write_text(_STAND_IN)
     build = ["cc", "-shared", "-fPIC", "-o", tmp_path / "libecf.so", tmp_path / "ecf.c"]
     subprocess.run(build, check=True)
-    step = str(np.random.default_rng().integers(1, 1000))
+    step = str(rng.integers(1, 1000))
     command = [sys.executable, "-c", _WRITE_AND_READ, step]
     environment = {**os.environ, "HDF5_PLUGIN_PATH": str(tmp_path)}
     subprocess.run(command, check=True, cwd=tmp_path, env=environment)

@@ -11,8 +11,8 @@ from .helpers import random_stream
 
 
 @pytest.fixture(name="seed")
-def _seed() -> int:
-    return int(np.random.default_rng().integers(1 << 31))
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(1 << 31))
 
 
 def _repaired(folder: Path, s: EventStream, t: np.ndarray) -> tuple[EventStream, list[str]]:
