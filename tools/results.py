@@ -34,9 +34,9 @@ KEPT = ROOT / "docs" / "results"
 PAGES = ("README.md", "docs/bench.md", "docs/results.md")
 FIGURE = ROOT / "docs" / "images" / "convergence.png"
 LONGER = ROOT / "benchmarks" / "knee.yaml"
+"""Suite of rows of ``stage`` that make more steps."""
 TWICE_AGAIN = "_16000"
 """Ends the names of its rows that ran twice as long as the others there."""
-"""Suite of rows of ``stage`` that make more steps."""
 COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
 """Captures that every method is compared on."""
 FOR_USERS = (
