@@ -35,8 +35,8 @@ PAGES = ("README.md", "docs/bench.md", "docs/results.md")
 FIGURE = ROOT / "docs" / "images" / "convergence.png"
 LONGER = ROOT / "benchmarks" / "knee.yaml"
 """Suite of rows of ``stage`` that make more steps."""
-TWICE_AGAIN = "_16000"
-"""Ends the names of its rows that ran twice as long as the others there."""
+_STEPS = re.compile(r"_\d+$")
+"""Ends the names of its rows that ran longer still, each below one of half its steps."""
 COMPARED = ("man_dance_hard_256", "woman_dance_b_256", "real_beam_256")
 """Captures that every method is compared on."""
 FOR_USERS = (
@@ -210,9 +210,11 @@ def _body(page: str) -> str:
 def doubled(records: Records, longer: Records) -> str:
     """Cells that ran longer, behind the same of the table, over the seeds that both ran."""
     lines = [f"| method | steps | {' | '.join(COMPARED)} |", f"|---|---|{'---|' * len(COMPARED)}"]
+    half: dict[str, tuple[Records, str]] = {}
     for row in longer.plan.suite.rows:
-        name = row.name.removesuffix(TWICE_AGAIN)
-        pair = _both_ran((records if name == row.name else longer, name), (longer, row.name))
+        name = _STEPS.sub("", row.name)
+        pair = _both_ran(half.get(name, (records, name)), (longer, row.name))
+        half[name] = longer, row.name
         steps = [of.figure(named, lambda r: r["iteration"], COMPARED) for of, named in pair]
         if None in steps:
             continue
