@@ -110,7 +110,7 @@ def fill_caches(trainer: Trainer, visited: int) -> None:
         trainer.capture.image(frame)
         for objective in trainer.composition.objectives:
             if isinstance(objective, RenderedSemantics):
-                objective.bounds[frame.mid_us]()
+                objective.bounds[frame.camera, frame.mid_us]()
             if isinstance(objective, EventWindows):
                 objective.events.between(*frame.exposure_us)
 

@@ -13,11 +13,14 @@ from evsplat.similarity import ssim
 def make(seed: int, *, dssim: bool = True):
     """Two frames at 10 and 20 us, a render at each and one between that no frame saw."""
     generator = torch.Generator().manual_seed(seed)
-    frames = [SimpleNamespace(name=name, mid_us=mid) for name, mid in (("a", 10), ("b", 20))]
+    middles = {"a": 10, "b": 20}
+    frames = [SimpleNamespace(name=n, camera="main", mid_us=mid) for n, mid in middles.items()]
     pictures = {name: torch.rand(20, 24, 3, generator=generator) for name in "ab"}
     capture = SimpleNamespace(train_frames=frames, image=lambda frame: pictures[frame.name])
     rgb = torch.rand(3, 20, 24, 3, generator=generator)
-    step = SimpleNamespace(capture=capture, times_us=(10, 15, 20), rgb=rgb, observed=capture.image)
+    step = SimpleNamespace(
+        capture=capture, frame=frames[0], times_us=(10, 15, 20), rgb=rgb, observed=capture.image
+    )
     return Photometric(capture, lambda frame: None, dssim=dssim, perceptual=None), step, pictures
 
 
@@ -63,3 +66,18 @@ def test_the_perceptual_distance_is_of_crops_between_minus_one_and_one_that_are_
         assert torch.equal(image, 2 * step.rgb[0][2:18, 3:11] - 1)
         assert torch.equal(reference, 2 * pictures["a"][2:18, 3:11] - 1)
         assert float(terms["perceptual"]) == pytest.approx(float((image - reference).abs().mean()))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_cameras_with_one_trigger_each_is_compared_with_its_own_pictures(seed):
+    _, step, pictures = make(seed)
+    main = step.capture.train_frames
+    aside = [SimpleNamespace(name=f.name * 2, camera="aside", mid_us=f.mid_us) for f in main]
+    pictures |= {frame.name: 1 - pictures[frame.name[0]] for frame in aside}
+    step.capture.train_frames = [frame for pair in zip(main, aside, strict=True) for frame in pair]
+    objective = Photometric(step.capture, lambda frame: None, dssim=False, perceptual=None)
+    for frames in (main, aside):
+        step.frame = frames[seed % 2]
+        pairs = zip(step.rgb[::2], frames, strict=True)
+        apart = [float((rgb - pictures[frame.name]).abs().mean()) for rgb, frame in pairs]
+        assert float(objective.loss(step)["l1"]) == pytest.approx(sum(apart) / 2, rel=1e-6)

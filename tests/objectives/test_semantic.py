@@ -1,6 +1,7 @@
 """Semantic targets from the posed body, and the cross-entropy against them."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -43,12 +44,16 @@ def test_cross_entropy_is_the_closed_form(probability):
     bounds = silhouette_bounds(disc(8), 5)
     soft = torch.tensor([0.1, 0.5, 0.9])
     step = SimpleNamespace(
+        frame=SimpleNamespace(camera="main"),
         times_us=(10, 20),
         data=DeviceCache("cpu", 0),
         semantic=torch.full((2, 40, 50), probability),
         model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: soft)),
     )
-    terms = RenderedSemantics({20: lambda: PackedBounds.of(disc(8), 5)}).loss(step)
+    # What another camera sees at a time says nothing of this one's pictures.
+    places = {("main", 20): disc(8), ("aside", 20): disc(3), ("aside", 10): disc(8)}
+    found = {place: partial(PackedBounds.of, mask, 5) for place, mask in places.items()}
+    terms = RenderedSemantics(found).loss(step)
     inside, outside = (float(mask.float().mean()) for mask in bounds)
     expected = -inside * math.log(probability) - outside * math.log(1 - probability)
     assert float(terms["semantic"]) == pytest.approx(expected, rel=1e-5)
@@ -57,6 +62,7 @@ def test_cross_entropy_is_the_closed_form(probability):
 
 def test_frames_without_bounds_say_nothing():
     step = SimpleNamespace(
+        frame=SimpleNamespace(camera="main"),
         times_us=(10,),
         semantic=torch.zeros(1, 4, 5),
         model=SimpleNamespace(gaussians=SimpleNamespace(semantics=lambda: torch.tensor([0.5]))),

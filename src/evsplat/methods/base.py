@@ -123,8 +123,8 @@ def body_frames(track: BodyTrack, times_us: Sequence[int]) -> BodyFrames:
 
 def semantic_bounds(
     capture: TrainingCapture, track: BodyTrack, band_px_at_256: float
-) -> Mapping[int, Callable[[], PackedBounds]]:
-    """Places of the person by the posed body, for each training frame's mid-exposure.
+) -> Mapping[tuple[str, int], Callable[[], PackedBounds]]:
+    """Places of the person by the posed body, for each training frame's camera and mid-exposure.
 
     ``band_px_at_256``: width of the undecided band around it, for a picture 256 pixels high. They
     are found when they are asked for, and those of the frames asked for last are kept.
@@ -140,23 +140,23 @@ def semantic_bounds(
         band = max(1, round(band_px_at_256 * camera.height / 256))
         return PackedBounds.of(mask.numpy(), band)
 
-    return _ByTime({frame.mid_us: frame for frame in frames}, found)
+    return _Found({(frame.camera, frame.mid_us): frame for frame in frames}, found)
 
 
 @dataclass(frozen=True)
-class _ByTime(Mapping[int, Callable[[], PackedBounds]]):
-    """What finds a frame's bounds, by its time; made when it is asked for, an hour having many."""
+class _Found(Mapping[tuple[str, int], Callable[[], PackedBounds]]):
+    """What finds a frame's bounds, by camera and time; made when asked for, an hour having many."""
 
-    frames: dict[int, Frame]
+    frames: dict[tuple[str, int], Frame]
     found: Callable[[Frame], PackedBounds]
 
-    def __getitem__(self, time_us: int) -> Callable[[], PackedBounds]:
-        return partial(self.found, self.frames[time_us])
+    def __getitem__(self, place: tuple[str, int]) -> Callable[[], PackedBounds]:
+        return partial(self.found, self.frames[place])
 
-    def __contains__(self, time_us: object) -> bool:
-        return time_us in self.frames
+    def __contains__(self, place: object) -> bool:
+        return place in self.frames
 
-    def __iter__(self) -> Iterator[int]:
+    def __iter__(self) -> Iterator[tuple[str, int]]:
         return iter(self.frames)
 
     def __len__(self) -> int:

@@ -19,8 +19,8 @@ class Photometric(OfMiddle):
     """L1, D-SSIM and an optional perceptual distance on the person's box (A18, A19).
 
     The paper's reading: one sharp-time render is compared with the blurry frame. Every rendered
-    time that is the mid-exposure of a training frame counts, not the drawn frame alone, because
-    its render is there already.
+    time that is the mid-exposure of a training frame of the same camera counts, not the drawn frame
+    alone, because its render is there already.
     """
 
     def __init__(
@@ -37,13 +37,15 @@ class Photometric(OfMiddle):
         ``perceptual_term`` is what that term is called.
         """
         super().__init__(capture)
-        self.frames = {frame.mid_us: frame for frame in capture.train_frames}
+        # Cameras that are triggered together have frames with one middle.
+        self.frames = {(frame.camera, frame.mid_us): frame for frame in capture.train_frames}
         self.box_of, self.dssim, self.perceptual = box_of, dssim, perceptual
         self.perceptual_term = perceptual_term
 
     def loss(self, step: Step) -> dict[str, Tensor]:
         """``l1``, ``dssim`` and ``perceptual`` as configured, means over pictures and pixels."""
-        frames = [self.frames.get(time) for time in step.times_us]
+        camera = step.frame.camera
+        frames = [self.frames.get((camera, time)) for time in step.times_us]
         seen = [
             (frame, rendered, step.observed(frame))
             for frame, rendered in zip(frames, step.rgb, strict=True)

@@ -126,24 +126,26 @@ class RenderedSemantics(Objective):
 
     def __init__(
         self,
-        bounds: Mapping[int, Callable[[], PackedBounds]],
+        bounds: Mapping[tuple[str, int], Callable[[], PackedBounds]],
     ) -> None:
-        """``bounds`` of the posed body, by mid-exposure (microseconds) of the training frames."""
+        """``bounds`` of the posed body, by the training frames' camera and mid-exposure (us)."""
         self.bounds = bounds
 
     def prefetch(self, frame: Frame, nominal: float, data: DeviceCache) -> None:
         """The bounds at the frame's mid-exposure."""
-        if frame.mid_us in self.bounds:
-            data.prefetch(("bounds", frame.mid_us), lambda: self.bounds[frame.mid_us]().masks())
+        place = frame.camera, frame.mid_us
+        if place in self.bounds:
+            data.prefetch(("bounds", *place), lambda: self.bounds[place]().masks())
 
     def loss(self, step: Step[PaperModel | DiscModel]) -> dict[str, Tensor]:
         """``semantic`` and the pressure ``binarise`` = mean m (1 - m) (A2)."""
         values: list[Float[Tensor, ""]] = []
         for time, drawn in zip(step.times_us, step.semantic, strict=True):
-            if time not in self.bounds:
+            place = step.frame.camera, time
+            if place not in self.bounds:
                 continue
-            packed = self.bounds[time]()
-            masks = packed if runs_native(drawn) else step.data.get(("bounds", time), packed.masks)
+            packed, key = self.bounds[place](), ("bounds", *place)
+            masks = packed if runs_native(drawn) else step.data.get(key, packed.masks)
             values.append(membership_loss(drawn, masks))
         soft = step.model.gaussians.semantics()
         half = constant((0.5,), soft).expand_as(soft)

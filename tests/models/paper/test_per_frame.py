@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from evsplat.models.paper.per_frame import interpolated, seen, seen_or_last
+from evsplat.models.paper.per_frame import (
+    FrameLatents,
+    FramePoses,
+    interpolated,
+    seen,
+    seen_or_last,
+)
 
 ANCHORS = torch.tensor([100.0, 200.0, 400.0], dtype=torch.float64)
 
@@ -27,3 +33,17 @@ def test_as_released_only_middles_are_seen_and_all_else_has_the_last_latent():
     first, second = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
     assert seen(ANCHORS, times).tolist() == [first, second, nothing, last, nothing]
     assert seen_or_last(ANCHORS, times).tolist() == [first, second, last, last, last]
+
+
+@pytest.mark.parametrize("unseen", ["interpolated", "released"])
+def test_frames_of_several_cameras_share_what_is_learned_of_a_time(rng, unseen):
+    """Whether all of one camera come first or both have one trigger."""
+    once = np.unique(rng.integers(0, 10_000, size=6)).tolist()
+    for times in (once + once, [time for time in once for _ in range(2)]):
+        latents, poses = FrameLatents(times, 3, unseen), FramePoses(times, 2, unseen)
+        assert latents.frame_times.tolist() == poses.frame_times.tolist() == once
+        values = torch.from_numpy(rng.normal(size=(len(once), 3))).float()
+        with torch.no_grad():
+            latents.values.copy_(values)
+        assert torch.allclose(latents(times), values[[once.index(time) for time in times]])
+        assert poses.residual(times)[0].isfinite().all()

@@ -15,6 +15,11 @@ training frames around them (A22). ``released``: as 3DGS-Avatar's code, the late
 training frame and no pose correction."""
 
 
+def _anchors(frame_times_us: Sequence[int]) -> Float[Tensor, " F"]:
+    """Times in order, each once: several cameras see one person, and may have one trigger."""
+    return torch.tensor(sorted(set(frame_times_us)), dtype=torch.float64)
+
+
 def interpolated(anchors_us: Float[Tensor, " F"], times_us: Sequence[int]) -> Float[Tensor, "T F"]:
     """Linear interpolation between the frames around each time; held at the ends."""
     times = send(torch.tensor(list(times_us), dtype=torch.float64), anchors_us.device)
@@ -53,7 +58,7 @@ class FramePoses(nn.Module):
     def __init__(self, frame_times_us: Sequence[int], joints: int, unseen: UnseenFrames) -> None:
         """``frame_times_us``: mid-exposures of the training frames."""
         super().__init__()
-        times = torch.tensor(list(frame_times_us), dtype=torch.float64)
+        times = _anchors(frame_times_us)
         self.register_buffer("frame_times", times)
         self.share = interpolated if unseen == "interpolated" else seen
         self.rotations = nn.Parameter(torch.zeros(len(times), joints, 3))
@@ -87,7 +92,7 @@ class FrameLatents(nn.Module):
     def __init__(self, frame_times_us: Sequence[int], size: int, unseen: UnseenFrames) -> None:
         """``frame_times_us``: mid-exposures of the training frames."""
         super().__init__()
-        times = torch.tensor(list(frame_times_us), dtype=torch.float64)
+        times = _anchors(frame_times_us)
         self.register_buffer("frame_times", times)
         self.share = interpolated if unseen == "interpolated" else seen_or_last
         self.values = nn.Parameter(torch.zeros(len(times), size))
