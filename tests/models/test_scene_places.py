@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -67,3 +68,16 @@ def test_places_of_a_scene_that_learns_are_drawn_anew_now_and_then(posed, drawin
     resumed.rows_changed()
     resumed.of(layers, camera, 2)
     assert len(drawings) == 3
+
+
+def test_two_cameras_at_rest_have_their_own_places_in_whatever_order_they_come(posed, rng):
+    layers, camera = posed
+    aside = camera.world_to_camera.clone()
+    aside[0, 3] += 0.5
+    cameras = [camera, replace(camera, world_to_camera=aside)]
+    expected = [places_of(scene_depth(layers, each), each, 2) for each in cameras]
+    assert not torch.equal(*expected)
+    places = ScenePlaces(refresh=3)
+    # Often the same one again, until what is kept has grown old.
+    for which in np.repeat(rng.integers(0, 2, 40), rng.integers(1, 5, 40)):
+        assert torch.equal(places.of(layers, cameras[which], 2), expected[which])

@@ -62,6 +62,8 @@ class ScenePlaces:
             given += [scene.means, scene.quaternions, scene.scales, scene.opacities]
         if not (kept and self._same(given, camera)):
             self.kept = places_of(scene_depth(layers, camera), camera, step)
+            # Of these it is asked next; the comparison before may have been spared.
+            self._given.again(given)
             self.seen, self.age = [tensor.detach().clone() for tensor in given], 0
             self.camera = camera
         self.age += 1
