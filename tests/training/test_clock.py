@@ -79,3 +79,19 @@ def test_the_rest_of_a_schedule_is_passed_in_as_few_steps_as_are_said():
 def test_a_schedule_with_fewer_steps_left_stays_as_it_is():
     clock = Clock(iterations=200, may_end_early=True, iteration=180, fraction=0.9)
     assert not clock.end_in(25) and not clock.ends_at
+
+
+def test_a_run_that_was_to_fit_a_time_goes_on_from_where_it_stands_without_one(rng):
+    """Its schedule is far ahead of its steps; what is left of it is passed evenly."""
+    short = Clock(iterations=1_000, max_seconds=60.0, shrink=True)
+    for _ in range(int(rng.integers(5, 50))):
+        short.advance(1.0)
+    kept = ("iteration", "fraction", "seconds", "step_seconds")
+    clock = Clock(iterations=1_000, **{name: getattr(short, name) for name in kept})
+    before, end = clock.fraction, clock.expected_iterations
+    assert before > 2 * clock.iteration / clock.iterations
+    while not clock.done:
+        clock.advance(1.0)
+        assert clock.done or clock.fraction - before == pytest.approx(1 / 1_000)
+        before = clock.fraction
+    assert clock.fraction == 1.0 and abs(clock.iteration - end) <= 1

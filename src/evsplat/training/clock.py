@@ -64,8 +64,10 @@ class Clock:
         self.step_seconds += share * (step_seconds - self.step_seconds)
         self.seconds += step_seconds
         left = self._steps_left()
+        # Steps of a time limit that holds no more went ahead: what they left is passed evenly.
+        ahead = self.fraction > self.iteration / self.iterations
         self.iteration += 1
-        if self.shrink or self.ends_at:
+        if self.shrink or self.ends_at or ahead:
             self.fraction += (1 - self.fraction) / max(left, 1.0)
         else:
             # From the integer, so that a thousand additions leave no rounding behind.
