@@ -183,3 +183,12 @@ def test_overlap_with_the_true_masks_of_a_shared_capture(captures_root: Path, na
             for frame, mask in found
         ]
         assert np.mean(overlaps) > least
+
+
+def test_what_differs_beside_a_thin_body_is_nobody(rng: np.random.Generator) -> None:
+    """An arm alone is in view: it has no middle, and what moves beside it covers none of it."""
+    body, differs = np.zeros((2, 96, 80), bool)
+    left, width = int(rng.integers(10, 60)), int(rng.integers(1, 4))
+    body[10:90, left : left + width] = True
+    differs[20:70, left + width + 1 : left + width + 5] = True
+    assert not clean(differs, body).any()

@@ -117,7 +117,8 @@ def clean(
 ) -> Bool[np.ndarray, "H W"]:
     """The piece of the differences that is the person whose bare body is ``body``.
 
-    None where the body is out of view; where no body is given it is the largest piece.
+    Nothing where the body is out of view, or no piece covers any of it; where no body is given it
+    is the largest piece.
     """
     if body is None:
         person, weight = binary_opening(differs), np.ones_like(differs)
@@ -134,6 +135,8 @@ def clean(
         return np.zeros_like(differs)
     covered = np.bincount(pieces[weight], minlength=count + 1)
     covered[0] = 0
+    if not covered.any():  # what differs lies beside a body too thin for a middle of its own
+        return np.zeros_like(differs)
     return binary_fill_holes(pieces == int(covered.argmax()))
 
 
