@@ -123,3 +123,21 @@ def test_what_is_far_from_the_body_stays_in_the_scene(body):
     assert flip_labels(gaussians, adam, frames) == 0
     assert gaussians.scene_count == 1
     assert gaussians.semantic_logits[-1] == 0.0
+
+
+def test_what_joins_takes_no_colour_of_what_leaves_at_the_same_time(body, rng):
+    """The body stands as in canonical space, so that one who leaves may be the nearest in it."""
+    frames = BodyFrames(body, torch.eye(4).repeat(1, len(body.parents), 1, 1))
+    vertices = body.canonical_vertices()
+    chosen = vertices[rng.choice(len(vertices), 12, replace=False)]
+    joins = chosen[:1] + 1e-4
+    gaussians, adam = make(chosen, torch.cat([joins, chosen[:1] + 9]))
+    with torch.no_grad():
+        gaussians.semantic_logits[0] = -0.5
+        gaussians.semantic_logits[gaussians.human_count] = 0.5
+        colours = gaussians.get_parameter(gaussians.colour)
+        colours[gaussians.human] = torch.arange(12.0)[:, None]
+    assert flip_labels(gaussians, adam, frames) == 2
+    row = int((gaussians.semantic_logits[gaussians.human] == 0.5).nonzero())
+    nearest = 1 + int(torch.cdist(joins, chosen[1:]).argmin())
+    assert (gaussians.get_parameter(gaussians.colour)[row] == nearest).all()

@@ -50,7 +50,9 @@ def flip_labels(gaussians: GaussianSet, optimiser: RowAdam, frames: BodyFrames) 
         values["semantic_logits"][joining[~near]] = 0.0
         joining = joining[near]
         carry(values, joining, transforms)
-        _take_colour(gaussians.colour, values, joining, torch.nonzero(human)[:, 0])
+        # Those that leave are in the scene already, place and colour.
+        staying = torch.nonzero(human & wants_human)[:, 0]
+        _take_colour(gaussians.colour, values, joining, staying)
 
     moved = torch.zeros_like(human)
     moved[leaving] = True
