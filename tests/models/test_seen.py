@@ -128,3 +128,17 @@ def test_one_number_that_is_none_is_refused_wherever_it_stands(name, wrong):
     tensors[name][2] = wrong
     with pytest.raises(ValueError, match="not finite"):
         Seen.of(tensors, 3)
+
+
+@pytest.mark.parametrize("method", ["evsplat", "paper", "avatar3dgs"])
+def test_of_a_person_without_gaussians_nothing_was_seen(tiny_capture, method):
+    """All of them may have been pruned; the end of a training asks what was seen all the same."""
+    capture = load_capture(tiny_capture())
+    composition = built(method, capture)
+    model = composition.model
+    (rows,) = model.sets.values()
+    rows.set_rows({name: rows.get_parameter(name)[rows.scene] for name in rows.attributes}, 0)
+    for cache in model.row_caches.values():
+        cache.rows_changed()
+    seen = seen_by(model, composition.capture or capture.for_training(Policy()))
+    assert [tuple(value.shape) for value in vars(seen).values()] == [(0,), (0,), (0, 3)]
