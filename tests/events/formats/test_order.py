@@ -90,3 +90,19 @@ def test_events_that_came_late_are_sorted_without_a_word_on_the_clock(
         f"repaired: sorts events that are out of order ({falls:,}), by {depth.max():,} us at most, "
         f"after {latest_us:,} us"
     )
+
+
+@pytest.mark.parametrize(("top", "bottom"), [(1 << 32, 0), (1 << 31, -(1 << 31)), (1 << 31, 0)])
+@pytest.mark.parametrize("count", [400, 200_000])
+def test_events_that_come_late_where_a_counter_begins_again_count_one_period(
+    tmp_path: Path, seed: int, top: int, bottom: int, count: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    s = random_stream(seed, count, gap_us=2)
+    t = s.t - s.t[count // 2]  # 0 is where the counter begins again
+    order = np.argsort(t + rng.integers(0, 40, count), kind="stable")  # packets that come late
+    counter = np.where(t < 0, top + t, bottom + t)[order]
+    read, notes = _repaired(tmp_path, s, counter)
+    assert np.array_equal(read.t, top + t)
+    assert "repaired: adds up the periods of a counter that began again (1)" in notes
+    assert not any(note.startswith("warning: no event comes") for note in notes)

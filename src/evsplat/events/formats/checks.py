@@ -12,6 +12,7 @@ from evsplat.events.stream import EventStream
 _MAX_GAP_AT_WRAP_US = 60_000_000
 # Where a counter ends and where it begins again: unsigned and signed 32 bits, 31 bits
 _COUNTER_RANGES_US = ((1 << 32, 0), (1 << 31, -(1 << 31)), (1 << 31, 0))
+_LEAST_RISE_TO_TOP_US = (1 << 31) - 2 * _MAX_GAP_AT_WRAP_US
 _MIN_BLOCK_EVENTS = 1 << 16
 _MAX_TIME_US = 1 << 60
 _LONGEST_US = 24 * 3600 * 1_000_000
@@ -76,7 +77,7 @@ class _Settled:
         self._limits = (width or 1 << 16, height or 1 << 16)
         self._has_polarity = has_polarity
         self._seen_zero = self._seen_negative = self._zeros_as_darker = False
-        self._shift_us = 0
+        self._shift_us = self._most_shift_us = 0
         self._last_raw_us: int | None = None
         self._latest_us: int | None = None
         self._longest_us = _SILENCE_US
@@ -107,22 +108,30 @@ class _Settled:
                 f"{low} to {high} us; no recording is that long, check the "
                 f"file, or give the unit of a table with {SAY_UNIT}."
             )
-        if rising:
-            return (t + self._shift_us if self._shift_us else t), True
+        if rising and not self._shift_us:
+            return t, True
+        if rising and high - before < _LEAST_RISE_TO_TOP_US:
+            return t + self._shift_us, True
         shifts = np.zeros(len(t), dtype=np.int64)
         previous = np.concatenate([[before], t[:-1]])
         for top, bottom in _COUNTER_RANGES_US:
-            ends = (previous < top) & (previous >= top - _MAX_GAP_AT_WRAP_US)
-            begins = (t >= bottom) & (t < bottom + _MAX_GAP_AT_WRAP_US)
-            shifts[ends & begins] = top - bottom
+            shifts[_at_end(previous, top) & _at_begin(t, bottom)] = top - bottom
+            # an event from before the counter began again, which came after others that are not
+            shifts[_at_begin(previous, bottom) & _at_end(t, top)] = bottom - top
+        shift_us = self._shift_us
         for at in np.flatnonzero(shifts):
-            self._damage.found(
-                f"the time falls from {previous[at]} to {t[at]} us at event {index + at}: its "
-                f"{int(shifts[at]).bit_length() - 1}-bit counter began again",
-                repaired_by="adds up the periods of a counter that began again",
-            )
+            if shift_us + shifts[at] < 0:
+                shifts[at] = 0  # the counter did not begin again yet
+            shift_us += int(shifts[at])
+            if shift_us > self._most_shift_us:
+                self._most_shift_us = shift_us
+                self._damage.found(
+                    f"the time falls from {previous[at]} to {t[at]} us at event {index + at}: its "
+                    f"{int(shifts[at]).bit_length() - 1}-bit counter began again",
+                    repaired_by="adds up the periods of a counter that began again",
+                )
         shifts = np.cumsum(shifts) + self._shift_us
-        self._shift_us = int(shifts[-1])
+        self._shift_us = shift_us
         return t + shifts, False
 
     def _remark_silence(self, t: np.ndarray, rising: bool, index: int) -> None:
@@ -184,6 +193,16 @@ class _Settled:
             count=count,
         )
         return ~outside if keep is None else keep & ~outside
+
+
+def _at_end(t: np.ndarray, top: int) -> np.ndarray:
+    """Whether times may be the last ones before a counter that ends at ``top`` begins again."""
+    return (t < top) & (t >= top - _MAX_GAP_AT_WRAP_US)
+
+
+def _at_begin(t: np.ndarray, bottom: int) -> np.ndarray:
+    """Whether times may be the first ones after a counter began again at ``bottom``."""
+    return (t >= bottom) & (t < bottom + _MAX_GAP_AT_WRAP_US)
 
 
 def _signs(positive: np.ndarray) -> np.ndarray:
