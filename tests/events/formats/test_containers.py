@@ -46,6 +46,12 @@ def _metavision(file: h5py.File, s: EventStream) -> None:
     file.attrs["geometry"] = "320x240"
 
 
+def _fixed_length(file: h5py.File, s: EventStream) -> None:
+    """As C writes a text: so many bytes."""
+    _metavision(file, s)
+    file.attrs.create("geometry", np.bytes_("320x240"))
+
+
 def _e2vid(file: h5py.File, s: EventStream) -> None:
     file["events/ts"], file["events/xs"] = s.t * 1e-6, s.x.astype("i2")
     file["events/ys"], file["events/ps"] = s.y.astype("i2"), s.p > 0
@@ -72,7 +78,7 @@ def _mvsec(file: h5py.File, s: EventStream) -> None:
     file["self"] = h5py.SoftLink("/")
 
 
-@pytest.mark.parametrize("write", [_dsec, _metavision, _e2vid, _v2e, _m3ed, _mvsec])
+@pytest.mark.parametrize("write", [_dsec, _metavision, _fixed_length, _e2vid, _v2e, _m3ed, _mvsec])
 def test_hdf5_layouts_give_the_same_events(
     tmp_path: Path, write: Callable[[h5py.File, EventStream], None]
 ) -> None:
@@ -82,7 +88,7 @@ def test_hdf5_layouts_give_the_same_events(
     recording = open_recording(tmp_path / "e.anything")
     assert recording.format == "hdf5" and recording.has_polarity
     assert same(recording.read(), s)
-    known = write in (_metavision, _e2vid)
+    known = write in (_metavision, _fixed_length, _e2vid)
     assert (recording.width, recording.height) == ((320, 240) if known else (None, None))
 
 

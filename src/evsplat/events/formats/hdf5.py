@@ -214,7 +214,10 @@ def _size(file: h5py.File) -> tuple[int | None, int | None]:
         if "sensor_resolution" in attributes:  # e2vid: rows first
             rows, columns = (int(n) for n in attributes["sensor_resolution"][:2])
             return columns, rows
-        match = re.fullmatch(r"(\d+)x(\d+)", str(attributes.get("geometry", "")))
+        geometry = attributes.get("geometry", "")
+        if isinstance(geometry, bytes):  # of a fixed length
+            geometry = geometry.decode("latin-1")
+        match = re.fullmatch(r"(\d+)x(\d+)", str(geometry))
         if match:
             return int(match[1]), int(match[2])
     return None, None
