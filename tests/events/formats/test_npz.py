@@ -94,3 +94,20 @@ def test_event_beside_the_sensor_is_an_error_or_left_out(tmp_path: Path) -> None
     keep = np.arange(300) != 7
     assert same(recording.read(), EventStream(s.t[keep], s.x[keep], s.y[keep], s.p[keep]))
     assert recording.notes == ["repaired: leaves out events beside the sensor (1)"]
+
+
+@pytest.mark.parametrize("size", [np.nan, np.inf, -3, 0, "wide", 1 << 20])
+def test_a_size_that_no_sensor_has_is_told(tmp_path: Path, size: float | str) -> None:
+    s = random_stream(5, 20)
+    np.savez(tmp_path / "e.npz", t=s.t, x=s.x, y=s.y, p=s.p, width=size, height=240)
+    with pytest.raises(DataError, match="e.npz: width is .*, expected a side of the sensor"):
+        open_recording(tmp_path / "e.npz")
+
+
+@pytest.mark.parametrize("columns", [("t", "x", "p"), ("t", "x", "xy"), ("-", "-", "-")])
+def test_columns_without_all_of_t_x_and_y_are_told(
+    tmp_path: Path, columns: tuple[str, ...]
+) -> None:
+    np.save(tmp_path / "e.npy", np.arange(15).reshape(5, 3))
+    with pytest.raises(DataError, match=f"--columns is {','.join(columns)}, expected t, x, y"):
+        open_recording(tmp_path / "e.npy", columns=columns)

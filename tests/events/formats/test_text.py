@@ -108,3 +108,17 @@ def test_bad_text_is_a_data_error(tmp_path: Path, text: str, message: str) -> No
     (tmp_path / "e.txt").write_text(text)
     with pytest.raises(DataError, match=message):
         read_events(tmp_path / "e.txt")
+
+
+def test_a_remark_below_the_names_of_columns_names_none(tmp_path: Path) -> None:
+    s = random_stream(6, 50)
+    path = tmp_path / "e.txt"
+    path.write_text("# y x t p\n# recorded by Jane Doe\n" + _lines(s.y, s.x, s.t, s.p))
+    assert same(read_events(path), s)
+
+
+def test_a_first_line_of_two_numbers_that_are_no_size_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "e.txt"
+    path.write_text("1e999 240\n" + "1 2 3 1\n" * 5)
+    with pytest.raises(DataError, match="its first line is '1e999 240', expected width and height"):
+        open_recording(path)

@@ -12,9 +12,10 @@ from evsplat.events.formats.base import (
     RawEvents,
     Source,
 )
-from evsplat.events.formats.table import Table, match_names, table_order
+from evsplat.events.formats.table import NAMES, Table, match_names, table_order
 from evsplat.options import ReadOptions
 from evsplat.untrusted.arrays import read_plain_arrays
+from evsplat.untrusted.faults import brief
 
 _SIZE_KEYS = (("width", "height"), ("sensor_width", "sensor_height"))
 
@@ -31,12 +32,25 @@ class Npz(Source):
         self.notes = self._table.notes
         for wide, high in _SIZE_KEYS:
             if all(key in arrays and arrays[key].size == 1 for key in (wide, high)):
-                self.width, self.height = int(arrays[wide].item()), int(arrays[high].item())
+                self.width, self.height = (
+                    _pixels(self.path, key, arrays[key]) for key in (wide, high)
+                )
 
     def blocks(self) -> Iterator[RawEvents]:
         """Slices of the arrays."""
         for first in range(0, len(self._table), BLOCK_EVENTS):
             yield self._table.events(slice(first, first + BLOCK_EVENTS), first)
+
+
+def _pixels(path: Path, key: str, array: np.ndarray) -> int:
+    """The one number of an array, a side of the sensor."""
+    value = array.item()
+    if array.dtype.kind not in "iuf" or not 0 < value <= 1 << 16:
+        raise DataError(
+            f"{path}: {key} is {brief(value)}, expected a side of the sensor, 1 to 65536 pixels; "
+            "write the file anew."
+        )
+    return int(value)
 
 
 def _components(
@@ -66,7 +80,13 @@ def _components(
             raise DataError(
                 f"{path}: its table has {tables[0].shape[1]} columns, --columns names {len(order)}."
             )
-        return {name: tables[0][:, i] for i, name in enumerate(order) if name in "txyp"}
+        named = {name: tables[0][:, i] for i, name in enumerate(order) if name in NAMES}
+        if not {"t", "x", "y"} <= set(named):
+            raise DataError(
+                f"{path}: --columns is {','.join(order)}, expected t, x, y and perhaps p, and '-' "
+                "for what to pass over."
+            )
+        return named
     shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items())
     raise DataError(
         f"{path}: no events found among its arrays ({shapes}); expected t, x, y, p (or xy, t, "

@@ -132,6 +132,11 @@ def match_names(given: Iterable[str], wanted: Mapping[str, str] | None = None) -
     return found
 
 
+def names_pixels(given: Iterable[str]) -> bool:
+    """Whether names are those of t, x and y at least."""
+    return {"t", "x", "y"} <= set(match_names(given))
+
+
 def assumed_unit(unit: str) -> str:
     """The note that times are read in a unit that the file does not tell."""
     return f"times are taken for {unit}; if they are not, write the file anew with {SAY_UNIT}"

@@ -19,6 +19,7 @@ from evsplat.events.formats.table import (
     assumed_unit,
     guess_time_unit,
     match_names,
+    names_pixels,
     table_order,
     to_polarity,
 )
@@ -82,13 +83,12 @@ class Text(Source):
         """Component of each column, or "" to pass over it."""
         file, given = self._file, options.columns
         if given is None and file.names:
-            named = match_names(file.names)
-            if not {"t", "x", "y"} <= set(named):
+            if not names_pixels(file.names):
                 raise DataError(
                     f"{self.path}: its columns are named {', '.join(file.names)}; say which are "
                     f"t, x, y and p with {SAY_COLUMNS}."
                 )
-            component = {name: key for key, name in named.items()}
+            component = {name: key for key, name in match_names(file.names).items()}
             return [component.get(name, "") for name in file.names]
         if given is None and file.fields == len(_MMHPSD_COLUMNS) and not file.names:
             self.notes.append(

@@ -1,5 +1,6 @@
 """Layout of a text file of events: its header, its delimiter, the names of its columns."""
 
+import math
 import re
 from codecs import BOM_UTF8
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ import numpy as np
 
 from evsplat.errors import DataError
 from evsplat.events.formats.base import ByteReader
+from evsplat.events.formats.table import names_pixels
 
 MAX_LINE_BYTES = 4096
 _MAX_HEADER_LINES = 100
@@ -73,12 +75,13 @@ def inspect_text(path: Path) -> TextFile:
                         "of columns; not a recording that evsplat reads. Expected an event in each "
                         "line: numbers with a decimal point, between commas, semicolons or blanks."
                     )
-                if len(fields) >= 3:
+                # what is remarked below the names of the columns names none
+                if len(fields) >= 3 and not (is_comment and names_pixels(names)):
                     names, size = _read_names([field.decode("latin-1") for field in fields])
                 continue
             if len(fields) == 2 and size == (None, None):
                 # the first line of E2VID's text files is the size of the sensor
-                size = (int(float(fields[0])), int(float(fields[1])))
+                size = _read_size(path, fields)
                 continue
             lines = [raw] + [reader.read_line(MAX_LINE_BYTES) for _ in range(_SAMPLE_LINES)]
             sample, whole = _read_sample(lines, delimiter, len(fields))
@@ -114,6 +117,17 @@ def _read_sample(lines: list[bytes], delimiter: bytes, count: int) -> tuple[np.n
         for column, field in enumerate(fields):
             whole[column] &= field.lstrip(b"+-").isdigit()
     return np.array(rows, dtype=np.float64).reshape(-1, count), whole
+
+
+def _read_size(path: Path, fields: list[bytes]) -> tuple[int, int]:
+    width, height = (float(field) for field in fields)
+    if not (math.isfinite(width) and math.isfinite(height)):
+        line = b" ".join(fields)[:60].decode("latin-1")
+        raise DataError(
+            f"{path}: its first line is {line!r}, expected width and height of the sensor in "
+            "pixels, or an event; correct the line."
+        )
+    return int(width), int(height)
 
 
 def _read_names(fields: list[str]) -> tuple[list[str], tuple[int | None, int | None]]:
