@@ -18,7 +18,7 @@ from evsplat.capture import Capture, load_capture
 from evsplat.capture.distortion import Distortion
 from evsplat.errors import DataError
 from evsplat.events import count_map
-from evsplat.pictures.files import ImageCache
+from evsplat.pictures.files import ImageCache, write_image
 
 from .editing import edit
 
@@ -255,6 +255,20 @@ def test_median_background_is_the_median_of_the_train_frames(tiny_capture: Facto
     stack = torch.stack([capture.image(frame) for frame in capture.train_frames])
     expected = np.median(stack.numpy(), axis=0)
     assert np.allclose(capture.median_background().numpy(), expected, atol=1e-6)
+
+
+def test_pictures_of_several_kinds_have_a_median(
+    tiny_capture: Factory, rng: np.random.Generator
+) -> None:
+    """8 and 16 bits, grey and colour, as of a folder of pictures that two programs wrote."""
+    path = tiny_capture()
+    for frame in load_capture(path).train_frames:
+        kind = rng.choice([np.uint8, np.uint16])
+        picture = rng.uniform(0, 1, (24, 32, 3) if rng.random() < 0.5 else (24, 32))
+        write_image(frame.image, np.round(picture * np.iinfo(kind).max).astype(kind))
+    capture = load_capture(path)
+    stack = np.stack([capture.image(frame).numpy() for frame in capture.train_frames])
+    assert np.allclose(capture.median_background().numpy(), np.median(stack, axis=0), atol=1e-6)
 
 
 def test_distortion_is_removed_from_pictures_masks_and_events(tiny_capture: Factory) -> None:

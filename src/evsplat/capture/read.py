@@ -281,8 +281,10 @@ class CaptureReader:
         frames = evenly_spread(train, most)
         pictures = tqdm(frames, "background", unit="picture", leave=False, disable=None)
         stored = [self._stored(frame.image, frame.camera, frame.gain) for frame in pictures]
-        if any(frame.gain for frame in frames):  # those without are still as they are stored
+        if len({picture.dtype for picture in stored}) > 1:  # of 8 and of 16 bits, or with a gain
             stored = [to_unit_range(picture).numpy() for picture in stored]
+        if len({picture.ndim for picture in stored}) > 1:  # grey ones among others
+            stored = [to_rgb(torch.from_numpy(picture)).numpy() for picture in stored]
         stack = np.stack(stored)
         del stored
         counted = tqdm(range(stack.shape[1]), "median", unit="row", leave=False, disable=None)
