@@ -17,6 +17,7 @@ from evsplat.calibration.offset import (
 )
 from evsplat.events import EventStream, open_recording
 from evsplat.pictures.files import to_unit_range
+from evsplat.pictures.squares import square_means
 
 HEIGHT, WIDTH = 24, 36
 STEP_US, PERIOD_US, EXPOSURE_US = 1_000, 40_000, 25_000
@@ -200,3 +201,23 @@ def test_a_recording_too_long_to_be_held_is_refused(monkeypatch) -> None:
     monkeypatch.setattr(offset, "LONGEST_S", 0.3)
     with pytest.raises(TooLong, match="its events last longer than 0.3 s"):
         estimate_offset(seen(light, 0, 10), [sent(light)], (WIDTH, HEIGHT))
+
+
+def test_blocks_of_pictures_that_were_made_smaller_are_those_of_the_sensor(
+    rng: np.random.Generator,
+) -> None:
+    for _ in range(20):
+        height, width = (int(side) for side in rng.integers(60, 400, 2))
+        factor = int(rng.integers(1, 6))
+        slope = rng.uniform(0.2, 1, 2) / (height, width)
+        light = np.exp((slope[:, None] * np.mgrid[:height, :width].reshape(2, -1)).sum(0) - 2)
+        image = np.stack([light, 0 * light + 0.2]).reshape(2, height, width)
+        whole, small = BlockChanges("linear"), BlockChanges("linear", (width, height))
+        for start, picture in enumerate(image):
+            span_us = (start * PERIOD_US, start * PERIOD_US + EXPOSURE_US)
+            whole.add(torch.from_numpy(picture), span_us)
+            small.add(torch.from_numpy(square_means(picture, factor, np.float64)), span_us)
+        (expected,), (found,) = whole.changes, small.changes
+        assert found.shape == expected.shape
+        moved = np.abs(expected) > 0.3  # where blocks have no pixel of a change that is too small
+        assert np.abs(found - expected)[moved].max() < 1.5 * factor * slope.sum()

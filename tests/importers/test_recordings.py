@@ -226,6 +226,25 @@ def test_a_davis_whose_events_have_a_clock_of_their_own_is_brought_onto_that_of_
     assert part.clock_offset_us == pytest.approx(expected_us, abs=PERIOD_US / 2)
 
 
+@pytest.mark.parametrize("wider", range(4))
+def test_the_offset_is_found_as_well_where_pictures_are_made_smaller(
+    tmp_path: Path, wider: int
+) -> None:
+    """Of any size: the blocks of small pictures are those of the sensor."""
+    path = tmp_path / "dance.aedat4"
+    frames = [
+        (np.pad(picture, ((0, 0), (0, wider)), mode="edge"), start, end)
+        for picture, start, end in some_frames(EPOCH_US)
+    ]
+    events = events_of_the_bar(EPOCH_US + 3_000_000)
+    path.write_bytes(aedat4(events, WIDTH + wider, HEIGHT, frames))
+    whole, small = (
+        run("davis", path, tmp_path / f"by{factor}", clock_offset_us="auto", shrink=factor)
+        for factor in (1, 2)
+    )
+    assert small.clock_offset_us == pytest.approx(whole.clock_offset_us, abs=PERIOD_US / 2)
+
+
 def test_a_davis_whose_offset_is_not_found_is_told_that_it_needs_none(
     davis: Path, tmp_path: Path
 ) -> None:

@@ -63,8 +63,10 @@ class OffsetEstimate:
 class BlockChanges:
     """How blocks change from frame to frame, gathered one frame at a time, ascending in time."""
 
-    def __init__(self, transfer: Transfer) -> None:
+    def __init__(self, transfer: Transfer, size: tuple[int, int] | None = None) -> None:
+        """``size`` is width and height of the sensor where pictures are made smaller than it."""
         self._transfer: Transfer = transfer
+        self._size = size
         self._darkest = _darkest(transfer)
         self._before: tuple[Float[np.ndarray, "H W"], tuple[int, int]] | None = None
         self.changes: list[Float[np.ndarray, " B"]] = []
@@ -84,7 +86,7 @@ class BlockChanges:
         if self._before is not None:
             change = light - self._before[0]
             change[np.abs(change) < _LEAST_CHANGE] = 0.0
-            self.changes.append(block_means(change))
+            self.changes.append(block_means(_as_large(change, self._size)))
             self.spans_us.append((self._before[1], span_us))
         self._before = light, span_us
 
@@ -95,8 +97,8 @@ def estimate_offset(
     """The offset at which what events add up to correlates best with how frames change.
 
     Tried are all offsets at which the events cover a change between two frames. ``events`` are the
-    consecutive pieces of the recording, ``size`` is width and height of pictures and sensor. None
-    where nothing changes, or no event is there.
+    consecutive pieces of the recording, ``size`` is width and height of the sensor, which sees what
+    the pictures show. None where nothing changes, or no event is there.
 
     Raises:
         TooLong: The recording is longer than `LONGEST_S`.
@@ -150,6 +152,18 @@ def block_means(pixels: Float[np.ndarray, "H W"]) -> Float[np.ndarray, " B"]:
     rows, columns, count = _grid(*pixels.shape)
     block = (rows[:, None] * count + columns).ravel()
     return np.bincount(block, pixels.ravel()) / np.bincount(block)
+
+
+def _as_large(
+    pixels: Float[np.ndarray, "h w"], size: tuple[int, int] | None
+) -> Float[np.ndarray, "H W"]:
+    """Each pixel as often as ``size``, width and height, asks for, so that blocks are the same."""
+    if size is None or pixels.shape == size[::-1]:
+        return pixels
+    rows, columns = (
+        np.arange(whole) * n // whole for n, whole in zip(pixels.shape, size[::-1], strict=True)
+    )
+    return pixels[rows[:, None], columns]
 
 
 def _darkest(transfer: Transfer) -> float:

@@ -24,14 +24,17 @@ _LIKELY = 4
 
 
 def offset_or_changes(
-    clock_offset_us: int | Literal["auto"], camera: dict[str, Any]
+    clock_offset_us: int | Literal["auto"], camera: dict[str, Any], size: tuple[int, int]
 ) -> int | BlockChanges:
-    """The clock's offset; where it is to be found, what is to be gathered of the frames for it."""
+    """The clock's offset; where it is to be found, what is to be gathered of the frames for it.
+
+    ``size`` is that of the pictures as recorded, in whose pixels the events are.
+    """
     if not isinstance(clock_offset_us, str):
         return clock_offset_us
     if clock_offset_us != "auto":
         raise ConfigError(f"--clock-offset-us {clock_offset_us}: expected microseconds or auto.")
-    return BlockChanges(camera.get("transfer", "power"))
+    return BlockChanges(camera.get("transfer", "power"), size)
 
 
 def likely_offsets(
@@ -45,9 +48,11 @@ def likely_offsets(
     Whatever way events are mirrored, turned or inverted, of pixels about where those of pictures
     of ``size`` lie.
     """
-    found = _offsets(changes, pieces(), path, size, 1)
-    if not (found and found[0].is_certain):
-        for way, inverted in product(WAYS.values(), (False, True)):
+    found = _offsets(changes, pieces(), path, size, _LIKELY)
+    if found and found[0].is_certain:
+        return [round(found[0].offset_us)]
+    for (name, way), inverted in product(WAYS.items(), (False, True)):
+        if in_words(name, inverted=inverted):  # as they are, they were looked at
             turned = _turned(pieces(), way, size, inverted=inverted)
             found += _offsets(changes, turned, path, size, _LIKELY)
     apart: list[OffsetEstimate] = []

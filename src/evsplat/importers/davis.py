@@ -85,7 +85,7 @@ class Davis(Importer):
         camera, focal, guessed = recorded_camera(self.camera, self.focal, size)
         camera, small = shrunk_camera({**camera, "transfer": self.transfer}, size, self.shrink)
         writer.add_camera("main", *small, **camera)
-        clock_offset = offset_or_changes(self.clock_offset_us, camera)
+        clock_offset = offset_or_changes(self.clock_offset_us, camera, size)
         wanted, numbered = set(kept), enumerate(recording.frames())
         for index, frame in tqdm(numbered, "pictures", len(spans), leave=False):
             if index in wanted:

@@ -117,7 +117,7 @@ class Folder(Importer):
         seen = _with_poses(kept, motion, middles, path)
         views = _camera_poses(motion)
         masks = _Masks(self._masks(source))
-        clock_offset = offset_or_changes(self.clock_offset_us, camera)
+        clock_offset = offset_or_changes(self.clock_offset_us, camera, size)
         spans = {index: (int(exposures[index, 0]), int(exposures[index, 1])) for index in seen}
         finder = place_finder(self.homography, list(spans.values()), camera)
         for index, timed in pictures_of(footage, seen):

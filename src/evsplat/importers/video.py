@@ -87,7 +87,7 @@ class Video(Importer):
             camera["transfer"] = self.transfer
         camera, small = shrunk_camera(camera, size, self.shrink)
         writer.add_camera("main", *small, **camera)
-        clock_offset = offset_or_changes(self.clock_offset_us, camera)
+        clock_offset = offset_or_changes(self.clock_offset_us, camera, size)
         kept = chosen_frames(self.frames, list(range(len(footage.times_us))), source)
         middles = (footage.times_us + self.start_us).tolist()
         spans = {index: exposure_around(middles[index], self.exposure_us) for index in kept}
