@@ -133,6 +133,17 @@ def test_a_davis_whose_clock_was_set_is_read_up_to_there_or_from_there(
     assert np.array_equal(one.t, other.t) and np.array_equal(one.x, other.x)
 
 
+def test_frames_that_a_repair_leaves_out_are_told(tmp_path: Path, rng: np.random.Generator) -> None:
+    """The events are read after them, and are whole."""
+    path, lost = tmp_path / "dance.aedat4", int(rng.integers(1, COUNT - 1))
+    data = aedat4(some_events(EPOCH_US), WIDTH, HEIGHT, some_frames(EPOCH_US), compression=0)
+    parts = data.split(b"FRME")
+    path.write_bytes(b"FRME".join(parts[:-lost]) + b"LOST" + b"FRME".join(parts[-lost:]))
+    capture = run("davis", path, tmp_path / "out", repair=True)
+    assert len(capture.frames) == COUNT - 1
+    assert "repaired: leaves out damaged packets (1)" in capture.provenance["notes"]
+
+
 def test_aedat3_makes_the_capture_that_aedat4_makes(davis: Path, tmp_path: Path) -> None:
     # the clock of 31 bits begins again within an exposure
     begin_us = (1 << 31) - 3_000 - 2 * PERIOD_US - EXPOSURE_US // 2

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from tqdm import tqdm
@@ -31,9 +30,9 @@ from evsplat.importers.recorded import (
     shrunk_camera,
     write_recorded_events,
 )
-from evsplat.options.declare import Flag, option
+from evsplat.options.captures import Skip, Stop
+from evsplat.options.declare import Flag
 from evsplat.pictures.light import Transfer
-from evsplat.ranges import AtLeast
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,9 +53,9 @@ class Davis(Importer):
     """Added to the events' times to get the clock of the pictures; auto finds it."""
     contrast: Contrast = None
     """Contrast thresholds of the sensor, brighter and darker, where they are known."""
-    skip: Annotated[int, AtLeast(0), option("N")] = 0
+    skip: Skip = 0
     """Leave out so many events at the beginning of the file, as of another recording in it."""
-    stop: Annotated[int | None, AtLeast(1), option("N", default="the end")] = None
+    stop: Stop = None
     """Leave out event N of the file, counted from 0, and all after it."""
     repair: Flag = False
     """Read on where the recording is damaged."""
@@ -73,6 +72,7 @@ class Davis(Importer):
         for index, frame in enumerate(recording.frames()):
             spans.append(_span(source, index, frame))
             shapes.append(frame.image.shape[:2])
+        repaired = recording.notes  # of the frames: a pass over the events begins anew
         first = next((piece for piece in recording.chunks() if len(piece)), None)
         if not spans or first is None:
             raise _incomplete(source, recording, has_frames=bool(spans))
@@ -103,7 +103,8 @@ class Davis(Importer):
             shrink=self.shrink,
             one_file=True,
         )
-        notes = [*recording.notes, *notes, *large_pictures(small), *([guessed] if guessed else [])]
+        read = dict.fromkeys([*repaired, *recording.notes])  # both may end in the same packet
+        notes = [*read, *notes, *large_pictures(small), *([guessed] if guessed else [])]
         writer.provenance |= {
             "source": f"DAVIS recording {source.name}",
             "focal": focal,

@@ -9,6 +9,10 @@ from evsplat.errors import ConfigError
 from evsplat.options.declare import Flag, Sensor, Transfer, Use, check_options, option
 from evsplat.ranges import Above, AtLeast, Within
 
+Skip = Annotated[int, AtLeast(0), option("N")]
+Stop = Annotated[int | None, AtLeast(1), option("N", default="the end")]
+"""Numbers of events in their file: the first that is read, and one past the last."""
+
 
 @dataclass(frozen=True)
 class ReadOptions:
@@ -29,9 +33,9 @@ class ReadOptions:
     """Columns of the sensor."""
     height: Annotated[int | None, Within(1, 65536), option("PX", default="as the file says")] = None
     """Rows of the sensor."""
-    skip: Annotated[int, AtLeast(0), option("N")] = 0
+    skip: Skip = 0
     """Leave out so many events at the beginning of the file, as of another recording."""
-    stop: Annotated[int | None, AtLeast(1), option("N", default="the end")] = None
+    stop: Stop = None
     """Leave out event N of the file, counted from 0, and all after it."""
 
     def __post_init__(self) -> None:
