@@ -132,7 +132,7 @@ def gathered_changes(film: Film) -> ChangesSeen:
     """Those between the film's pictures."""
     seen = ChangesSeen(film.spans_us, "power")
     for picture, span in zip(film.pictures, film.spans_us, strict=True):
-        seen.add(torch.from_numpy(picture), span)
+        seen.add(lambda picture=picture: torch.from_numpy(picture), span)
     return seen
 
 

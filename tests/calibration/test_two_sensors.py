@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from evsplat.calibration.clock import estimate_clock
-from evsplat.calibration.two_sensors import SensorPlace
+from evsplat.calibration.two_sensors import ChangesSeen, SensorPlace
 from evsplat.calibration.ways import WAYS
 from evsplat.events import EventStream
 
@@ -113,3 +114,17 @@ def test_events_are_gathered_by_pieces_at_times_of_the_frames(rng: np.random.Gen
     assert np.array_equal(gathered_events.x, film.events.x)
     far = seen.events(pieces, offset + 10 * FRAMES * PERIOD_US)
     assert len(far) == 0
+
+
+def test_pictures_that_no_pair_needs_are_not_asked_for(rng: np.random.Generator) -> None:
+    spans_us = [(40_000 * index, 40_000 * index + 10_000) for index in range(400)]
+    seen, asked = ChangesSeen(spans_us, "linear"), []
+    for index, span_us in enumerate(spans_us):
+
+        def picture(index: int = index) -> torch.Tensor:
+            asked.append(index)
+            return torch.from_numpy(rng.random((12, 16)))
+
+        seen.add(picture, span_us)
+    times = {span_us for one in seen.pairs for span_us in (one.before_us, one.after_us)}
+    assert [spans_us[index] for index in asked] == sorted(times) and len(asked) < 100

@@ -1,7 +1,7 @@
 """Where the events of another sensor lie over pictures, found from what moves in both."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -119,13 +119,16 @@ class ChangesSeen:
         self.size: tuple[int, int] = (0, 0)
         self.step = 1
 
-    def add(self, image: Float[Tensor, "..."], span_us: tuple[int, int]) -> None:
-        """The next picture, (H, W) or (H, W, 3) of coded values in [0, 1], and its exposure."""
+    def add(self, image: Callable[[], Float[Tensor, "..."]], span_us: tuple[int, int]) -> None:
+        """The next picture, (H, W) or (H, W, 3) of coded values in [0, 1], and its exposure.
+
+        It is asked for where a pair needs it.
+        """
         index, self._count = self._count, self._count + 1
         before = [first for first, after in self._pairs if after == index]
         if not before and not any(first == index for first, _ in self._pairs):
             return
-        seen = exposure(image, span_us, transfer=self._transfer)
+        seen = exposure(image(), span_us, transfer=self._transfer)
         height, width = seen.log_luminance.shape
         self.size, self.step = (width, height), math.ceil(max(height, width) / _MAP_SIDE)
         for first in before:

@@ -54,7 +54,7 @@ class PlaceFinder:
 
     def add(self, picture: TimedPicture, exposure_us: tuple[int, int]) -> None:
         """The next picture, as recorded."""
-        self._seen.add(to_unit_range(picture.pixels), exposure_us)
+        self._seen.add(lambda: to_unit_range(picture.pixels), exposure_us)
 
     def mover(
         self, sensor: EventRecording, clock_offset: int | BlockChanges, writer: CaptureWriter
