@@ -110,6 +110,15 @@ def test_a_training_that_goes_on_from_before_drops_what_is_later(folder: Path) -
     assert steps(folder) == [10, 15]
 
 
+def test_behind_a_million_steps_the_newest_is_still_the_last(tmp_path: Path) -> None:
+    for iteration in (999_990, 1_000_000, 1_000_010, 10_000_000):
+        path = save(tmp_path, iteration)
+        assert checkpoints(tmp_path)[-1] == path
+        kept = load_latest(tmp_path)
+        assert kept is not None and kept[0] == path
+        assert len(checkpoints(tmp_path)) == (1 if iteration == 999_990 else checkpoint.KEEP)
+
+
 def test_files_that_are_not_named_by_a_step_are_no_checkpoints(folder: Path) -> None:
     (folder / "000020.safetensors").rename(folder / "20 old.safetensors")
     assert steps(folder) == [10]

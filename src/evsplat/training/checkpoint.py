@@ -37,7 +37,7 @@ def save_checkpoint(
         OutputError: No room, or no permission; the message says what is kept.
     """
     path = folder / f"{iteration:06d}.safetensors"
-    older = [old for old in checkpoints(folder) if old.name < path.name]
+    older = [old for old in checkpoints(folder) if int(old.stem) < iteration]
     try:
         write_state(path, tensors, state)
     except OutputError as error:
@@ -101,7 +101,9 @@ def _pieces(tensors: dict[str, Tensor], texts: dict[str, str]) -> Iterator[bytes
 
 def checkpoints(folder: Path) -> list[Path]:
     """The checkpoints of a run, the newest last."""
-    return sorted(path for path in folder.glob("*.safetensors") if path.stem.isdecimal())
+    found = (path for path in folder.glob("*.safetensors") if path.stem.isdecimal())
+    # By number: a million has a digit more than what names are padded to.
+    return sorted(found, key=lambda path: int(path.stem))
 
 
 def latest_checkpoint(folder: Path) -> Path | None:
