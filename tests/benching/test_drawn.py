@@ -59,16 +59,20 @@ def test_a_seed_of_the_draw_needs_a_suite_that_draws(tmp_path):
 
 
 def test_many_captures_are_compared_line_by_line():
-    """Mean, worst and wins of two rows on eight captures, of which one lacks the second row."""
-    rows = tuple(SuiteRow(name, "paper") for name in ("a", "b"))
+    """Mean, worst and wins of two rows on eight captures, of which one lacks the second row.
+
+    The camera's own picture, which no method sees, is nowhere the best.
+    """
+    methods = {"a": "paper", "b": "paper", "own": "own_picture"}
+    rows = tuple(SuiteRow(name, method) for name, method in methods.items())
     sources = {f"c{n}": CaptureSource(f"c{n}", Path("c"), "x") for n in range(8)}
     cells = tuple(
-        Cell(source, row.name, 0, "paper", None, (), 10, None)
+        Cell(source, row.name, 0, row.method, None, (), 10, None)
         for source in sources.values()
         for row in rows
     )
     plan = Plan(Suite("s", rows), sources, {}, cells)
-    psnr = {"a": [20.0 + n for n in range(8)], "b": [23.0] * 8}
+    psnr = {"a": [20.0 + n for n in range(8)], "b": [23.0] * 8, "own": [40.0] * 8}
     none = {"psnr": None, "ssim": None, "lpips_vgg": None, "lpips_alex": None, "st_lpips": None}
 
     def record(value):
@@ -95,4 +99,5 @@ def test_many_captures_are_compared_line_by_line():
     # b wins where it has 23 dB against less; at c3 both share the first place.
     assert table.footnotes[0] == "a: mean 23.50, worst 20.00 (c0), best on 5 of 8 captures."
     assert table.footnotes[1] == "b: mean 23.00, worst 23.00 (c1), best on 3 of 7 captures."
+    assert table.footnotes[2] == "own: mean 40.00, worst 40.00 (c0)."
     assert replace(table, by_row=False).rank(table.rows[1], 0) == 0

@@ -88,6 +88,19 @@ def test_best_and_second_are_of_rows_that_have_every_capture(records):
     assert shown["none (failed)"] == "–"
 
 
+def test_on_each_capture_the_rows_that_have_it_compete(records):
+    """A row without the first capture is the best on the second, and says what it lacks."""
+    for seed in (0, 1):
+        records.by_cell["two", "none", seed] = record(50.0, seed)
+    table = next(t for t in make_tables(records) if t.title.startswith("PSNR of every capture"))
+    shown = {row.title: table.cells(row, ("{}", "1: {}", "2: {}")) for row in table.rows}
+    of_two = len(REGIONS)
+    assert shown["half (1 of 2 captures)"][0].startswith("1: 99.00")
+    assert shown["none (1 of 2 captures)"][of_two].startswith("1: 50.00")
+    assert shown["Good*"][of_two].startswith("2: ")
+    assert "Test frames: 3 + 3." in table.note
+
+
 def test_published_figures_stand_beside_ours_of_the_same_captures(records):
     table = make_tables(records)[0]
     assert table.groups[0] == ("published", 3)

@@ -104,7 +104,7 @@ def _per_capture(records: Records) -> Table:
         for region in REGION_TITLES
     ]
     title = "PSNR of every capture, dB"
-    return _table(records, title, "standard", columns, records.captures[:1])
+    return _table(records, title, "standard", columns, records.captures, apart=True)
 
 
 def _capture_by_capture(records: Records) -> Table:
@@ -115,7 +115,13 @@ def _capture_by_capture(records: Records) -> Table:
     rows, region = records.plan.suite.rows, "person_mask"
     value = metric("standard", region, "psnr")
     found = {c: [records.figure(row.name, value, [c]) for row in rows] for c in records.captures}
-    lines = [Row(capture, tuple(figures)) for capture, figures in found.items()]
+    lines = [
+        Row(
+            capture,
+            tuple(_competing(row, figure) for row, figure in zip(rows, figures, strict=True)),
+        )
+        for capture, figures in found.items()
+    ]
     headings = tuple(Heading("", row.label, 2, True) for row in rows)
     table = Table(
         "PSNR of the person's pixels on every capture, dB",
@@ -130,11 +136,11 @@ def _capture_by_capture(records: Records) -> Table:
         if not known:
             continue
         worst = min(known, key=lambda capture: known[capture])
-        best = sum(table.rank(line, column) == 1 for line in lines)
-        notes.append(
-            f"{row.label}: mean {fmean(known.values()):.2f}, worst {known[worst]:.2f} ({worst}), "
-            f"best on {best} of {len(known)} captures."
-        )
+        note = f"{row.label}: mean {fmean(known.values()):.2f}, worst {known[worst]:.2f} ({worst})"
+        if row.method != OWN_PICTURE:
+            best = sum(table.rank(line, column) == 1 for line in lines)
+            note += f", best on {best} of {len(known)} captures"
+        notes.append(f"{note}.")
     return replace(table, footnotes=tuple(notes))
 
 
@@ -169,16 +175,21 @@ def _table(
     protocol: str,
     columns: Sequence[Column],
     captures: Sequence[str],
+    *,
+    apart: bool = False,
 ) -> Table:
-    """Read all figures; a row that lacks some of ``captures`` does not compete."""
+    """Read all figures; a row that lacks some of ``captures`` does not compete.
+
+    ``apart``: each column is of one capture, on which every row that has it competes.
+    """
     rows = []
     for row in records.plan.suite.rows:
         done = sum(bool(records.of(c, row.name)) for c in captures)
-        whole = done == len(captures) and row.method != OWN_PICTURE
+        whole = apart or done == len(captures)
         figures = []
         for heading, read in columns:
-            figure, competes = read(row), whole or heading.group == _PUBLISHED
-            figures.append(figure and replace(figure, competes=competes))
+            published = heading.group == _PUBLISHED
+            figures.append(read(row) if published else _competing(row, read(row), whole))
         row_title = title_of(records, row, captures)
         if 0 < done < len(captures):
             row_title += f" ({done} of {len(captures)} captures)"
@@ -189,6 +200,11 @@ def _table(
     note = next(p.summary for p in PROTOCOLS if p.name == protocol)
     caption = f"{protocol}: {note}. {_terms(records, captures)}"
     return Table(title, caption, tuple(heading for heading, _ in columns), tuple(rows))
+
+
+def _competing(row: SuiteRow, figure: Figure | None, whole: bool = True) -> Figure | None:
+    """A figure that may be the best if the row is ``whole``; the camera's own never is."""
+    return figure and replace(figure, competes=whole and row.method != OWN_PICTURE)
 
 
 def _terms(records: Records, captures: Sequence[str]) -> str:
