@@ -36,11 +36,12 @@ def _joints(run) -> np.ndarray:
     return _placed(source.track.body, source.pose(times)[1], turn)
 
 
-def _read_bvh(text: str) -> tuple[list[str], np.ndarray, float]:
+def _read_bvh(text: str, *, added: bool) -> tuple[list[str], np.ndarray, float]:
     """Names, joints (T, J, 3) and seconds per key, by the words of the format's description.
 
     Channels turn about the named axes in the order in which they stand, each one after those
-    before it in the joint's own axes; positions of a joint take the place of its offset.
+    before it in the joint's own axes; positions of a joint are ``added`` to its offset, as the
+    format's description has it and three.js does, or take its place, as Blender does.
     """
     words = text.split()
     hierarchy, motion = words[: words.index("MOTION")], words[words.index("MOTION") + 1 :]
@@ -72,7 +73,7 @@ def _read_bvh(text: str) -> tuple[list[str], np.ndarray, float]:
         for channel in channels[joint]:
             axis = "XYZ".index(channel[0])
             if channel.endswith("position"):
-                local[:, axis, 3] = rows[:, column]
+                local[:, axis, 3] = rows[:, column] + added * local[:, axis, 3]
             else:
                 angle = rows[:, column : column + 1]
                 turn = Rotation.from_euler(channel[0].lower(), angle, degrees=True)
@@ -83,9 +84,10 @@ def _read_bvh(text: str) -> tuple[list[str], np.ndarray, float]:
     return names, world[..., :3, 3], seconds
 
 
-def test_a_reader_by_the_formats_words_reads_the_bvh(run):
+@pytest.mark.parametrize("added", [True, False])
+def test_a_reader_by_the_formats_words_reads_the_bvh(run, added):
     path = export_run(run.path, "bvh")
-    names, joints, seconds = _read_bvh(path.read_text(encoding="ascii"))
+    names, joints, seconds = _read_bvh(path.read_text(encoding="ascii"), added=added)
     body = run.reconstruction.track.body
     order = [names.index("_".join(name.split())) for name in body.joint_names]
     np.testing.assert_allclose(joints[:, order], _joints(run), atol=1e-5)

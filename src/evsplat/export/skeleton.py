@@ -91,7 +91,10 @@ def export_motion(run: Run, path: Path, kind: MotionKind, motion: str | None) ->
 
 
 def write_bvh(path: Path | str, motion: FileMotion) -> None:
-    """Write a Biovision hierarchy: root position, then rotations in the order Z, X, Y, degrees."""
+    """Write a Biovision hierarchy: root position, then rotations in the order Z, X, Y, degrees.
+
+    The root's offset is zero: some programs add it to the position channels, others do not.
+    """
     order: list[int] = []
     lines = ["HIERARCHY"]
     children: dict[int, list[int]] = {}
@@ -108,7 +111,8 @@ def write_bvh(path: Path | str, motion: FileMotion) -> None:
         channels = f"6 Xposition Yposition Zposition {rotations}" if not depth else f"3 {rotations}"
         lines.append(f"{indent}{'JOINT' if depth else 'ROOT'} {motion.names[joint]}")
         lines.append(f"{indent}{{")
-        lines.append(f"{indent}  OFFSET {vector(motion.offsets[joint])}")
+        offset = motion.offsets[joint] if depth else np.zeros(3)
+        lines.append(f"{indent}  OFFSET {vector(offset)}")
         lines.append(f"{indent}  CHANNELS {channels}")
         for child in children.get(joint, []):
             add(child, depth + 1)
