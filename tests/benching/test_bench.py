@@ -100,6 +100,70 @@ def test_a_cell_that_died_goes_on_from_its_checkpoint(tiny_capture, tmp_path, mo
     assert seen == list(range(7, 12))
 
 
+@pytest.mark.parametrize("settings", [["event_weight=0"], []])
+def test_a_training_that_was_stopped_does_not_go_on_for_other_settings(
+    tiny_capture, tmp_path, monkeypatch, settings
+):
+    capture, out = tiny_capture("one"), tmp_path / "out"
+    other = PAPER | {"settings": [*PAPER["settings"], *settings]}
+    first = write_suite(tmp_path / "suite.yaml", {"one": capture}, PAPER)
+    folder, step = BenchFolder(out), Trainer.step
+    (cell,) = make_plan(read_suite(first), folder).cells
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
+
+    def dies(trainer):
+        if trainer.clock.iteration == 7:
+            raise SystemExit("as if the process was killed")
+        return step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", dies)
+    with pytest.raises(SystemExit):
+        run_cell(folder.path, cell, threads=1, device="cpu")
+    monkeypatch.setattr(Trainer, "step", step)
+    changed = write_suite(tmp_path / "suite.yaml", {"one": capture}, other)
+    with cells_in_this_process():
+        if not settings:
+            ev.bench(changed, out=out, jobs=1)
+            assert records(out)["one/paper/seed0.json"]["iteration"] == 12
+            return
+        with pytest.raises(ConfigError, match=r"begun.*settings.*choose another --out"):
+            ev.bench(changed, out=out, jobs=1)
+        shutil.rmtree(folder.run_of(cell.id))
+        ev.bench(changed, out=out, jobs=1)
+    assert "event_weight=0" in records(out)["one/paper/seed0.json"]["cell"]["settings"]
+
+
+def _staged(path: Path, seed: int, *rows: dict, **more: int) -> Path:
+    """A suite with a staged capture ``one``, and one for each of ``more``, by name and seed."""
+    seeds = {"one": seed} | {name.replace("_", "-"): other for name, other in more.items()}
+    captures = [
+        {"name": name, "stage": {"frames": 5, "width": 24, "seed": number}}
+        for name, number in seeds.items()
+    ]
+    path.write_text(json.dumps({"name": "s", "captures": captures, "rows": rows}))
+    return path
+
+
+def test_a_staged_capture_is_not_taken_for_one_of_other_settings(tmp_path):
+    seed, out = random.randrange(1 << 20), tmp_path / "out"
+    rows = (MEDIAN, {"name": "nearest", "method": "nearest_frame"})
+    with cells_in_this_process():
+        ev.bench(_staged(tmp_path / "a.yaml", seed, *rows), out=out, only=("median",), jobs=1)
+        suite = _staged(tmp_path / "b.yaml", seed + 1, *rows)
+        ev.bench(suite, out=out, only=("nearest",), jobs=1)
+    record = records(out)["one/nearest/seed0.json"]
+    assert record["status"] == "failed", seed
+    assert "was made by other settings or of another capture" in record["reason"]
+
+
+def test_a_staged_capture_may_not_have_the_name_of_a_restored_one(tmp_path):
+    row = {"name": "after-edi", "method": "paper", "restore": "edi"}
+    suite = read_suite(_staged(tmp_path / "a.yaml", 0, row, one_edi=1))
+    with pytest.raises(ConfigError, match="capture one-edi: .* row after-edi makes of capture one"):
+        make_plan(suite, BenchFolder(tmp_path / "out"))
+    assert make_plan(suite, BenchFolder(tmp_path / "out"), captures=(Path("one"),)).cells
+
+
 def test_failures_are_recorded_kept_and_tried_again_only_when_asked(tiny_capture, tmp_path, capsys):
     rows = (MEDIAN, {"name": "new", "method": "of_tomorrow"})
     suite = write_suite(tmp_path / "suite.yaml", {"one": tiny_capture("one")}, *rows)

@@ -5,6 +5,7 @@ import logging
 import resource
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -148,6 +149,7 @@ def run_cell(folder: Path, cell: Cell, *, threads: int | None, device: str) -> N
     bench = BenchFolder(folder)
     started = time.perf_counter()
     with exclusive(bench.lock_of(cell.id)):
+        write_json(bench.request_of(cell.id), cell.request())
         try:
             record = {"status": DONE, **_measured(bench, cell, threads, device)}
         except EvsplatError as error:
@@ -274,10 +276,28 @@ def _recorded(bench: BenchFolder, source: CaptureSource) -> Path:
                 f"rows; stop it, remove {bench.path} or choose another --out, and begin anew."
             )
         return source.path
-    with exclusive(bench.lock_of(f"captures/{source.path.name}")):
-        if not source.path.exists():
-            stage(source.path, source.stage, progress=False)
-    return source.path
+    make = partial(stage, source.path, source.stage, progress=False)
+    return _made(bench, source.path, source.fingerprint, make)
+
+
+def _made(bench: BenchFolder, path: Path, fingerprint: str, make: Callable[[], object]) -> Path:
+    """A folder in `BenchFolder.captures`, made where it is not there yet.
+
+    ``fingerprint`` is of what it is made of; a `DataError` where it was made of something else.
+    """
+    with exclusive(bench.lock_of(f"captures/{path.name}")):
+        maker = bench.maker_of(path)
+        if not path.exists():
+            write_json(maker, {"fingerprint": fingerprint})
+            make()
+        elif maker.exists():
+            of = read_record(maker, {"fingerprint": str}, "remove the file")["fingerprint"]
+            if of != fingerprint:
+                raise DataError(
+                    f"{path}: was made by other settings or of another capture than this row asks "
+                    f"for; remove {bench.path} or choose another --out, and begin anew."
+                )
+    return path
 
 
 def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
@@ -285,10 +305,8 @@ def _restored(bench: BenchFolder, recorded: Capture, cell: Cell) -> Path:
     if cell.restore is None:
         return recorded.path
     path = restored_at(bench, cell)
-    with exclusive(bench.lock_of(f"captures/{path.name}")):
-        if not path.exists():
-            restore_capture(recorded.path, path, method=cell.restore, policy=cell.policy)
-    return path
+    make = partial(restore_capture, recorded.path, path, method=cell.restore, policy=cell.policy)
+    return _made(bench, path, cell.capture.fingerprint, make)
 
 
 def restored_at(bench: BenchFolder, cell: Cell) -> Path:

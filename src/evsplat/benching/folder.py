@@ -40,6 +40,14 @@ class BenchFolder:
         """Run folder of a cell: checkpoints and pictures."""
         return self.path / "runs" / id
 
+    def request_of(self, id: str) -> Path:
+        """The request of a cell that has begun, JSON: what a training that was stopped is of."""
+        return self.path / "begun" / f"{id}.json"
+
+    def maker_of(self, capture: Path) -> Path:
+        """What a folder in `captures` is made of, JSON."""
+        return self.path / "made" / f"{capture.name}.json"
+
     def log_of(self, id: str) -> Path:
         """Output of a cell's process."""
         return self.path / "logs" / f"{id}.log"

@@ -1,7 +1,8 @@
 """The plan of a suite on this machine: captures found, cells in the order they are run."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from evsplat.benching.cell import (
     fingerprint_of,
     fingerprint_of_file,
     read_cell_record,
+    restored_at,
 )
 from evsplat.benching.drawn import drawn_settings
 from evsplat.benching.folder import BenchFolder
@@ -24,6 +26,7 @@ from evsplat.files import remove_file
 from evsplat.options import BenchOptions, StageSettings
 from evsplat.options.declare import given
 from evsplat.shipped import demo_capture
+from evsplat.untrusted.records import read_record
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,8 @@ def make_plan(
     ``named`` is how the suite was asked for, where that is not its name.
 
     Raises:
-        ConfigError: A row does not exist, or a number is out of range.
+        ConfigError: A row does not exist, a number is out of range, or a staged capture has the
+            name of a restored one.
     """
     options = given(BenchOptions, options, changes)
     draw = suite.draw
@@ -91,6 +95,7 @@ def make_plan(
         else:
             missing[capture.name] = source
     cells = tuple(cells_of(suite, sources.values()))
+    _check_restored(cells, sources, folder)
     for row in suite.rows:
         if row.pictures and sources and not any(cell.row == row.name for cell in cells):
             raise ConfigError(
@@ -106,12 +111,14 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
     """Cells without a record; ``retry`` forgets the records of failures.
 
     Raises:
-        ConfigError: The folder has a cell of the same place that was asked for otherwise.
+        ConfigError: The folder has a cell of the same place that was asked for otherwise, over or
+            begun.
     """
     todo = []
     for cell in plan.cells:
         path = folder.record_there(cell.id)
         if path is None:
+            _check_begun(cell, folder)
             todo.append(cell)
             continue
         record = read_cell_record(path)
@@ -125,6 +132,30 @@ def pending_cells(plan: Plan, folder: BenchFolder, *, retry: bool) -> list[Cell]
             remove_file(path)
             todo.append(cell)
     return todo
+
+
+def _check_begun(cell: Cell, folder: BenchFolder) -> None:
+    """Refuse to go on with a training that was begun otherwise: it keeps the settings it has."""
+    begun, run = folder.request_of(cell.id), folder.run_of(cell.id)
+    if cell.trains and begun.exists() and run.exists():
+        there = read_record(begun, {"seed": int}, f"remove {run} to begin its cell anew")
+        _check_same_request(begun, there, cell.request(), folder)
+
+
+def _check_restored(
+    cells: Iterable[Cell], sources: Mapping[str, CaptureSource], folder: BenchFolder
+) -> None:
+    """Refuse a staged capture whose folder is the one that a restored capture is made in."""
+    staged = {source.path: name for name, source in sources.items() if source.stage is not None}
+    for cell in cells if staged else ():
+        clash = None
+        with suppress(ConfigError):  # what is wrong with a row its record will say
+            clash = staged.get(restored_at(folder, cell).resolve()) if cell.restore else None
+        if clash is not None:
+            raise ConfigError(
+                f"capture {clash}: is the name of what row {cell.row} makes of capture "
+                f"{cell.capture.name} with {cell.restore}; give the capture another name."
+            )
 
 
 def _with_captures(suite: Suite, options: BenchOptions) -> Suite:
