@@ -371,6 +371,25 @@ def test_loss_is_that_of_the_avatar_and_nothing_else(reconstruction):
     assert worse.model_to_truth == loss.model_to_truth
 
 
+def test_a_frame_in_which_nobody_is_drawn_leaves_the_loss_finite(reconstruction, monkeypatch):
+    """Its mask is where somebody was seen, and poses may be far off."""
+    capture, source = reconstruction
+    avatar = avatar_of(source.at_rest(_views(capture)))
+    last, camera_of = capture.test_frames[-1], capture.camera
+
+    def turned_away(frame):
+        camera = camera_of(frame)
+        if frame is not last:
+            return camera
+        behind = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+        return replace(camera, world_to_camera=behind @ camera.world_to_camera)
+
+    monkeypatch.setattr(capture, "camera", turned_away)
+    loss = measure_loss(source, avatar, capture)
+    assert loss.frames == len(capture.test_frames)
+    assert math.isfinite(loss.avatar_to_model.person) and math.isfinite(loss.avatar_to_model.full)
+
+
 def test_the_package_is_complete_and_needs_no_network(run):
     run.capture.name = "two </script> <!--<script> ends"
     page = export_run(run.path, "avatar", parts="all", out=run.path / "dancer")

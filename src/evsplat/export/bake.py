@@ -12,6 +12,7 @@ from tqdm import tqdm
 from evsplat.camera import Camera
 from evsplat.capture import Capture
 from evsplat.errors import DataError
+from evsplat.evaluation.protocols import PSNR_CEILING_DB
 from evsplat.export.avatar import Avatar, Clip, avatar_of, clip_of, recorded_clip, write_avatar
 from evsplat.export.gaussians import cloud_at, facts_of, instant_of
 from evsplat.film import load_motion_of
@@ -112,7 +113,7 @@ def _elsewhere(
 
 @dataclass(frozen=True)
 class Psnr:
-    """PSNR, mean over frames, dB."""
+    """PSNR, mean over frames, dB; at most `PSNR_CEILING_DB` of each frame."""
 
     person: float
     """PSNR on the person's pixels."""
@@ -172,7 +173,9 @@ def measure_loss(source: GaussianReconstruction, avatar: Avatar, capture: Captur
             continue
 
         def of(image: Tensor, reference: Tensor, pixels: Tensor = pixels) -> Psnr:
-            return Psnr(float(psnr(image, reference, mask=pixels)), float(psnr(image, reference)))
+            # Where none of the person is drawn the pictures are equal.
+            values = (psnr(image, reference, mask=pixels), psnr(image, reference))
+            return Psnr(*(min(float(value), PSNR_CEILING_DB) for value in values))
 
         rows["avatar"].append(of(baked, model))
         if frame.sharp is not None:
