@@ -180,6 +180,7 @@ def test_a_held_moment_is_one_time_from_many_places(lamp, tmp_path):
         ({"transparent": True, "beside": True}, "--beside"),
         ({"show": "depth", "transparent": True}, "--transparent"),
         ({"motion": "walk", "beside": True}, "--beside"),
+        ({"show": "depth", "beside": True, "out": "folder"}, "--beside: a folder holds depth"),
         ({"motion_fps": 20.0}, "--motion-fps: goes with --motion"),
         ({"in_place": True}, "--in-place: goes with --motion"),
         ({"at": 99.0}, "--at 99"),

@@ -119,6 +119,11 @@ def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours:
     if suffix == ".gif" and film.fps > 50:
         raise ConfigError(f"--fps {film.fps:g}: a GIF plays at most 50 pictures a second.")
     if suffix not in (*_VIDEO, *_ANIMATION):
+        if film.beside and film.show == "depth":
+            raise ConfigError(
+                "--beside: a folder holds depth in millimetres, which no picture fits beside; give "
+                "--out a name in .mp4, .webp or .gif."
+            )
         if out.exists() and not out.is_dir():
             raise DataError(f"{out}: is a file; give a folder or a name in .mp4, .webp or .gif.")
         if not ours and out.is_dir() and any(out.iterdir()):
