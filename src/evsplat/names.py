@@ -37,6 +37,12 @@ def checked_name(text: str, what: str) -> str:
     return text
 
 
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Key by which frame9 comes before frame10."""
+    parts = re.findall(r"\d{1,300}|\D+", name)
+    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+
+
 def is_path_of_names(text: str) -> bool:
     """Whether a text is a relative path whose parts are names, so that it never goes up."""
     parts = PurePath(text).parts

@@ -84,6 +84,16 @@ def test_every_kind_of_file_gives_the_points_that_went_in(tmp_path, name, kind):
     assert found.world is None and (np.diff(found.sigma_px) < 0).all()
 
 
+@pytest.mark.parametrize("first", [0, 7, 98])
+def test_frames_of_a_folder_come_in_the_order_of_the_numbers_in_their_names(tmp_path, first):
+    """OpenPose names its files as the pictures are: 9 comes before 10, as among these."""
+    values = points(25)
+    for index, file in enumerate(sorted(write_openpose(tmp_path / "folder", values).iterdir())):
+        file.rename(file.with_name(f"clip2_{first + index}_keypoints.json"))
+    found = read_keypoints(tmp_path / "folder", TIMES)
+    np.testing.assert_allclose(found.places, values[..., :2])
+
+
 def test_without_confidences_all_points_are_seen(tmp_path):
     found = read_keypoints(write_npz(tmp_path / "a.npz", points(25, 2)), TIMES)
     assert (found.seen == 1).all()

@@ -1,6 +1,5 @@
 """Pictures with times, and a folder of them, one file each."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from evsplat.errors import DataError
+from evsplat.names import natural_order
 from evsplat.pictures.files import read_image
 from evsplat.untrusted.pictures import image_size
 
@@ -52,7 +52,8 @@ class FolderFootage:
     def __init__(self, path: Path, fps: float) -> None:
         self.path = path
         self._files = sorted(
-            (file for file in path.iterdir() if _is_picture(file)), key=_natural_order
+            (file for file in path.iterdir() if _is_picture(file)),
+            key=lambda file: natural_order(file.name),
         )
         if not self._files:
             raise DataError(f"{path}: holds no picture; expected PNG, JPEG, WebP, BMP or TIFF.")
@@ -81,9 +82,3 @@ class FolderFootage:
 
 def _is_picture(file: Path) -> bool:
     return file.is_file() and file.suffix.lower() in _SUFFIXES and not file.name.startswith(".")
-
-
-def _natural_order(file: Path) -> list[tuple[int, str]]:
-    """Key by which frame9 comes before frame10."""
-    parts = re.findall(r"\d+|\D+", file.name)
-    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]

@@ -7,7 +7,6 @@ of annotations or predictions, as MMPose and AlphaPose write), and arrays of fra
 
 import csv
 import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from jaxtyping import Float
 
 from evsplat.errors import DataError
 from evsplat.landmarks.landmarks import SETS
+from evsplat.names import natural_order
 from evsplat.untrusted.arrays import read_plain_arrays
 from evsplat.untrusted.faults import brief, open_text, reason
 from evsplat.untrusted.text import read_json
@@ -34,7 +34,7 @@ def read_points(path: Path) -> Float[np.ndarray, "N L D"]:
         DataError: missing, damaged, another form, or several people.
     """
     if path.is_dir():
-        files = sorted(path.glob("*.json"))
+        files = sorted(path.glob("*.json"), key=lambda file: natural_order(file.name))
         if not files:
             raise DataError(f"{path}: holds no .json file, expected OpenPose's, one per frame.")
         frames = [_openpose(file, read_json(file)) for file in files]
@@ -70,13 +70,8 @@ def _from_json(path: Path, content: Any) -> Float[np.ndarray, "N L D"]:
         if not isinstance(found, list):
             raise DataError(f"{path}: entry {index}: instances is no list.")
         frames.setdefault(json.dumps(frame), []).extend(found)
-    order = sorted(frames, key=_natural)
+    order = sorted(frames, key=natural_order)
     return _stack(path, [_one_person(path, f"frame {key[:80]}", frames[key]) for key in order])
-
-
-def _natural(key: str) -> tuple[tuple[int, ...], str]:
-    """Sorts frames by the numbers in their names: 2 before 10."""
-    return tuple(int(part) for part in re.findall("[0-9]{1,18}", key)), key
 
 
 def _one_person(path: Path, where: str, people: list[Any]) -> np.ndarray | None:
