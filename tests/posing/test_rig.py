@@ -57,6 +57,18 @@ def test_stature_follows_the_coefficients():
     )
 
 
+@pytest.mark.parametrize("wide", [1.0, 1.7, 2.5])
+def test_stature_is_the_way_up_however_far_the_arms_reach(wide):
+    def held_out(betas):
+        body, wider = default_body(np.pad(betas, (0, 8))), torch.tensor([wide, 1.0, 1.0])
+        vertices, joints = body.rest_vertices * wider, body.rest_joints * wider
+        return replace(body, rest_vertices=vertices, rest_joints=joints)
+
+    rig, plain = make_rig(held_out, "smpl", 2), default_rig()
+    assert rig.stature == pytest.approx(plain.stature)
+    torch.testing.assert_close(rig.growth, plain.growth[:2])
+
+
 @pytest.mark.parametrize(("names", "least"), [(BLAZEPOSE_33, 33), (COCO_17, 17), (OPENPOSE_25, 23)])
 def test_all_usual_sets_of_key_points_sit_on_the_rig(names, least):
     assert len(attach(default_rig(), names).index) >= least

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from evsplat.body import Body, default_body
-from evsplat.body.retarget import alignments, rest_from_zero
+from evsplat.body import Body, default_body, nearest_axis
+from evsplat.body.retarget import alignments, rest_from_zero, trunk_axes
 from evsplat.body.rotations import axis_angle_to_matrix, nearest_axis_angle
 from evsplat.body.skeleton import Skeleton, find_skeleton
 from evsplat.errors import DataError
@@ -101,7 +101,10 @@ def make_rig(body: Callable[[Float[np.ndarray, "B"]], Body], model: str, coeffic
     """The rig of a body with a number of shape coefficients, in which its joints are linear."""
     mean = body(np.zeros(coefficients))
     rest = mean.rest_joints.double().numpy()
-    up = _up(mean)
+    parents = tuple(mean.parents.tolist())
+    skeleton = find_skeleton(parents, mean.joint_names, model)
+    # Arms that are held out reach farther than a person is tall.
+    up = nearest_axis(torch.from_numpy(trunk_axes(skeleton, rest)[:, 1])).double().numpy()
     shaped = [body(one) for one in np.eye(coefficients)]
     directions = np.stack([one.rest_joints.double().numpy() - rest for one in shaped])
     height = mean.rest_vertices.double().numpy() @ up
@@ -110,8 +113,6 @@ def make_rig(body: Callable[[Float[np.ndarray, "B"]], Body], model: str, coeffic
     for one in shaped:
         grown = one.rest_vertices.double().numpy() @ up
         growth.append(grown[ends[0]] - grown[ends[1]] - (height[ends[0]] - height[ends[1]]))
-    parents = tuple(mean.parents.tolist())
-    skeleton = find_skeleton(parents, mean.joint_names, model)
     frames = _frames(skeleton, rest, parents)
     above = [max(parent, 0) for parent in parents]
     to_parent = frames[above]
@@ -214,12 +215,6 @@ def blazepose_offsets() -> dict[str, tuple[str, str, tuple[float, float, float]]
     resource = files("evsplat") / "data" / "posing" / "blazepose.json"
     rows = read_json(Path(str(resource)))["offsets"]
     return {name: (row[0], row[1], tuple(row[2])) for name, row in rows.items()}
-
-
-def _up(body: Body) -> np.ndarray:
-    """Unit axis along which the body stands at rest."""
-    vertices = body.rest_vertices.double().numpy()
-    return np.eye(3)[int((vertices.max(0) - vertices.min(0)).argmax())]
 
 
 def _row_of_joints(skeleton: Skeleton, count: int) -> tuple[Tensor, Tensor]:
