@@ -144,6 +144,42 @@ def test_acclaim_gives_the_joints_of_its_angles(tmp_path):
     assert np.abs(np.diff(motion.times_us) - 1e6 / 120).max() <= 1
 
 
+@pytest.mark.parametrize("told", ["skeleton", "motion", "both"])
+def test_acclaim_angles_may_be_radians(tmp_path, told):
+    angles, root = random_motion(4)
+    axes = np.random.default_rng(5).uniform(-60, 60, (len(NAMES), 3))
+    acclaim_files(tmp_path, angles, root, axes)
+    expected = load_motion(tmp_path / "07_01.amc").joints()
+    of_skeleton = np.radians(axes) if told != "motion" else axes
+    acclaim_files(tmp_path, np.radians(angles), root, of_skeleton)
+    skeleton, motion = tmp_path / "07.asf", tmp_path / "07_01.amc"
+    said = "" if told == "skeleton" else ":RADIANS"
+    motion.write_text(motion.read_text().replace(":DEGREES", said))
+    if told != "motion":
+        skeleton.write_text(skeleton.read_text().replace("angle deg", "angle rad"))
+    np.testing.assert_allclose(load_motion(motion).joints(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "other"),
+    [
+        (":root", ":root\n  order TX TY TZ RZ RY RX"),
+        (":root", ":root\n  order RX RY RZ TX TY TZ"),
+        (":root", ":root\n  axis ZYX"),
+        (" XYZ", " ZYX"),
+    ],
+)
+def test_acclaim_turns_in_another_order_are_refused(tmp_path, given, other):
+    acclaim_files(tmp_path, *random_motion(6), np.zeros((len(NAMES), 3)))
+    skeleton = tmp_path / "07.asf"
+    usual = ":root\n  order TX TY TZ RX RY RZ\n  axis XYZ"
+    skeleton.write_text(skeleton.read_text().replace(":root", usual))
+    load_motion(tmp_path / "07_01.amc")
+    skeleton.write_text(skeleton.read_text().replace(usual, ":root").replace(given, other, 1))
+    with pytest.raises(DataError, match=r"07\.asf: line \d+ cannot be read \(the order .*expected"):
+        load_motion(tmp_path / "07_01.amc")
+
+
 def deepmimic_frames(count: int = 3) -> np.ndarray:
     frames = np.zeros((count, 44))
     frames[:, 0] = 0.0333

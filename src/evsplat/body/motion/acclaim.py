@@ -19,6 +19,8 @@ _METRES = 0.0254
 _WORLD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """Rotation from x left, y up, z forward to z up, facing -y."""
 _TURNS = ("rx", "ry", "rz")
+_ROOT = ("tx", "ty", "tz", *_TURNS)
+"""What the root has numbers for, in this order."""
 
 
 @dataclass
@@ -34,10 +36,11 @@ class _Bone:
 def read_acclaim(path: Path, skeleton: Path) -> SkeletonMotion:
     """The motion ``path`` (.amc) of the skeleton ``skeleton`` (.asf), 120 frames a second.
 
-    A joint is where its bone begins. Angles are degrees about x, then y, then z.
+    A joint is where its bone begins. Angles are about x, then y, then z; in degrees, unless the
+    files say radians.
     """
-    bones, unit = _read_skeleton(skeleton)
-    frames = _read_frames(path)
+    bones, unit, degrees = _read_skeleton(skeleton)
+    frames, degrees = _read_frames(path, degrees)
     count = len(frames)
     check_extent(path, count, len(bones))
     local = np.tile(np.eye(3), (count, len(bones), 1, 1))
@@ -47,15 +50,16 @@ def read_acclaim(path: Path, skeleton: Path) -> SkeletonMotion:
         values = _values(path, frames, bone, 6 if bone.parent < 0 else len(bone.turns))
         if bone.parent < 0:
             positions = values[:, :3]
-            local[:, index] = Rotation.from_euler("xyz", values[:, 3:], degrees=True).as_matrix()
+            turned = Rotation.from_euler("xyz", values[:, 3:], degrees=degrees)
+            local[:, index] = turned.as_matrix()
             continue
         zero[index] = ends[bone.parent]
         ends[index] = zero[index] + bone.length * bone.direction
         angles = np.zeros((count, 3))
         for column, turn in enumerate(bone.turns):
             angles[:, _TURNS.index(turn)] = values[:, column]
-        turned = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-        local[:, index] = bone.axis @ turned @ bone.axis.T
+        turned = Rotation.from_euler("xyz", angles, degrees=degrees)
+        local[:, index] = bone.axis @ turned.as_matrix() @ bone.axis.T
     parents = [bone.parent for bone in bones]
     metres = _METRES / unit
     return SkeletonMotion(
@@ -70,9 +74,9 @@ def read_acclaim(path: Path, skeleton: Path) -> SkeletonMotion:
     )
 
 
-def _read_skeleton(path: Path) -> tuple[list[_Bone], float]:
-    """Bones with parents before children, the root first, and the unit of length."""
-    section, unit = "", 1.0
+def _read_skeleton(path: Path) -> tuple[list[_Bone], float, bool]:
+    """Bones with parents before children, the root first; the unit of length; True for degrees."""
+    section, unit, degrees = "", 1.0, True
     given: dict[str, _Bone] = {}
     current = _Bone("", -1)
     above: dict[str, str] = {}
@@ -85,13 +89,19 @@ def _read_skeleton(path: Path) -> tuple[list[_Bone], float]:
                 section = words[0]
             elif section == ":units" and words[0] == "length":
                 unit = float(words[1])
+            elif section == ":units" and words[0] == "angle":
+                degrees = not words[1].lower().startswith("rad")
+            elif section == ":root" and words[0] == "order":
+                _refuse_order(" ".join(words[1:]).lower(), " ".join(_ROOT))
+            elif section == ":root" and words[0] == "axis":
+                _refuse_order(words[1].lower(), "xyz")
             elif section == ":bonedata":
                 if words[0] == "begin":
                     current = _Bone("", 0)
                 elif words[0] == "end":
                     given[current.name] = current
                 else:
-                    _read_bone_line(current, words)
+                    _read_bone_line(current, words, degrees)
             elif section == ":hierarchy" and words[0] not in ("begin", "end"):
                 above |= {child: words[0] for child in words[1:]}
         except (ValueError, IndexError) as error:
@@ -108,10 +118,15 @@ def _read_skeleton(path: Path) -> tuple[list[_Bone], float]:
         bones.append(given[name])
     if len(bones) == 1 or unit <= 0:
         raise DataError(f"{path}: holds no bones or no unit of length, expected an .asf skeleton.")
-    return bones, unit
+    return bones, unit, degrees
 
 
-def _read_bone_line(bone: _Bone, words: list[str]) -> None:
+def _refuse_order(found: str, expected: str) -> None:
+    if found != expected:
+        raise ValueError(f"the order {found[:40]}, expected {expected}; export it in that order")
+
+
+def _read_bone_line(bone: _Bone, words: list[str], degrees: bool) -> None:
     if words[0] == "name":
         bone.name = words[1]
     elif words[0] == "direction":
@@ -119,7 +134,8 @@ def _read_bone_line(bone: _Bone, words: list[str]) -> None:
     elif words[0] == "length":
         bone.length = float(words[1])
     elif words[0] == "axis":
-        bone.axis = Rotation.from_euler("xyz", _three(words), degrees=True).as_matrix()
+        _refuse_order(" ".join(words[4:5]).lower() or "xyz", "xyz")
+        bone.axis = Rotation.from_euler("xyz", _three(words), degrees=degrees).as_matrix()
     elif words[0] == "dof":
         bone.turns = tuple(word.lower() for word in words[1:] if word.lower() in _TURNS)
 
@@ -131,7 +147,8 @@ def _three(words: list[str]) -> list[float]:
     return numbers
 
 
-def _read_frames(path: Path) -> list[dict[str, list[str]]]:
+def _read_frames(path: Path, degrees: bool) -> tuple[list[dict[str, list[str]]], bool]:
+    """Numbers of each bone in each frame; ``degrees`` unless the file says otherwise."""
     frames: list[dict[str, list[str]]] = []
     for line in read_text(path).splitlines():
         words = line.split()
@@ -139,9 +156,11 @@ def _read_frames(path: Path) -> list[dict[str, list[str]]]:
             frames.append({})
         elif frames and words:
             frames[-1][words[0]] = words[1:]
+        elif words and words[0].lower() in (":degrees", ":radians"):
+            degrees = words[0].lower() == ":degrees"
     if not frames:
         raise DataError(f"{path}: holds no frame, expected an .amc motion.")
-    return frames
+    return frames, degrees
 
 
 def _values(path: Path, frames: list[dict[str, list[str]]], bone: _Bone, count: int) -> np.ndarray:
