@@ -10,7 +10,7 @@ import pytest
 import torch
 from tests.posing.moving import CAMERA, landmarks
 
-from evsplat.capture import load_body_track, load_capture, validate_capture
+from evsplat.capture import Policy, load_body_track, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.options import PoseSearch
 from evsplat.posing import find, find_poses
@@ -255,3 +255,44 @@ def test_frames_without_anybody_are_left_out_and_named(tiny_capture, caplog, fro
     everybody = SimpleNamespace(times_us=np.array([picture.time_us for picture in pictures]))
     whole = find._with_somebody(capture, pictures, everybody, nobody_in_between=True)
     assert whole is capture
+
+
+@pytest.mark.parametrize(("entered", "left"), [(0, 7), (2, 7), (0, 5)])
+def test_of_key_points_frames_without_anybody_are_left_out_at_the_ends_alone(
+    unposed, tmp_path, caplog, entered, left
+):
+    """Of 7 training frames, after which come held-out ones, of which a file tells nothing."""
+    path, points = unposed
+    values = np.load(points)
+    for nobody in (slice(entered), slice(left, 7), entered + 1):
+        values[nobody] = np.nan
+    np.save(points, values)
+    out = tmp_path / "new"
+    find_poses(path, out, keypoints=points, height_m=1.8, refine_s=0, held_out_events=True)
+    frames = load_capture(path, needs_body=False).frames
+    kept = frames[entered : left if left < 7 else None]
+    assert [frame.name for frame in load_capture(out).frames] == [frame.name for frame in kept]
+    assert ("before the person enters" in caplog.text) == (entered > 0)
+    assert ("after they have left" in caplog.text) == (left < 7)
+
+
+def test_key_points_of_cameras_with_one_trigger_are_each_seen_through_their_own(unposed, tmp_path):
+    path, points = unposed
+    document = json.loads((path / "capture.json").read_text())
+    side = json.loads(json.dumps(document["cameras"]["main"]))
+    side["world_to_camera"][0][3] += 0.5
+    document["cameras"]["side"] = side
+    document["events"] = None
+    document["novel_views"] = []
+    document["frames"] += [
+        {**frame, "name": f"s{frame['name']}", "camera": "side"} for frame in document["frames"]
+    ]
+    (path / "capture.json").write_text(json.dumps(document))
+    capture = load_capture(path, needs_body=False)
+    seen = capture.for_training(Policy())
+    frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
+    times = [frame.mid_us for frame in frames if frame.split == "train"]
+    found = find._cameras(seen, times)
+    wanted = [capture.camera(frame) for frame in frames if frame.split == "train"]
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one.world_to_camera, other.world_to_camera)

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -197,11 +198,17 @@ def _found(
         with stages(bar, "landmarks"):
             pictures = sharp_pictures(seen)
             landmarks = _landmarks(seen, pictures, keypoints)
-            shown = _with_somebody(
-                capture, pictures, landmarks, nobody_in_between=keypoints is None
-            )
+            looked_at, told = pictures, landmarks
+            if keypoints is not None:
+                # a file tells of training frames alone, and has rows of those without anybody
+                looked_at = [one for one in pictures if one.frame.split == "train"]
+                told = landmarks.of_pictures(np.asarray(landmarks.seen.any(1)))
+            shown = _with_somebody(capture, looked_at, told, nobody_in_between=keypoints is None)
             if shown is not capture:
                 capture, seen = shown, _seen(shown, policy, focal_px)
+                kept_us = [frame.mid_us for frame in seen.train_frames]
+                if keypoints is not None:
+                    landmarks = landmarks.of_pictures(np.isin(landmarks.times_us, kept_us))
         with stages(bar, "fit"):
             fitted = _fit(seen, landmarks, rig, search)
             if search.focal == "auto":
@@ -211,7 +218,7 @@ def _found(
                 seen = _seen(capture, policy, focal_px)
                 logger.warning("%s", _rough(focal))
         track = fitted.track(key_times(seen))
-        shown_us = landmarks.times_us.tolist()
+        shown_us = landmarks.times_us[landmarks.seen.any(1)].tolist()
         refined: Refined | None = None
         dressed: Body | None = None
         if limit_s > 0:
@@ -335,10 +342,20 @@ def _rough(focal: FocalFit) -> str:
 
 
 def _cameras(capture: TrainingCapture, times_us: Sequence[int]) -> list[Camera]:
-    """The camera of the frame nearest to each time."""
-    mids = np.array([frame.mid_us for frame in capture.frames])
-    nearest = [int(np.abs(mids - time).argmin()) for time in times_us]
-    return [capture.camera(capture.frames[index]) for index in nearest]
+    """The camera of the training frame nearest to each time.
+
+    Of frames of one time, as cameras with one trigger have, each has its turn.
+    """
+    frames = sorted(capture.train_frames, key=lambda frame: frame.mid_us)
+    mids = np.array([frame.mid_us for frame in frames])
+    cameras: list[Camera] = []
+    turns: Counter[int] = Counter()
+    for time_us in times_us:
+        apart = np.abs(mids - time_us)
+        alike = np.flatnonzero(apart == apart.min())
+        cameras.append(capture.camera(frames[int(alike[turns[time_us] % len(alike)])]))
+        turns[time_us] += 1
+    return cameras
 
 
 def _write_body(

@@ -49,20 +49,18 @@ def poses_page(
 ) -> str:
     """The page as HTML, one file with its pictures inside."""
     cameras = {frame.name: capture.camera(frame) for frame in capture.frames}
-    by_time = {picture.time_us: picture for picture in pictures}
-    off = dict(zip(landmarks.times_us.tolist(), misfit(fitted), strict=True))
-    shown = [index for index, time in enumerate(landmarks.times_us) if int(time) in by_time]
+    shown_in = _pictures_of(landmarks, pictures)
+    off, shown = misfit(fitted), sorted(shown_in)
     chosen = evenly_spread(shown, _MOST)
     first = evenly_spread(chosen, _OPEN)
     rest = [index for index in chosen if index not in first]
-    worst = sorted((i for i in shown if off[int(landmarks.times_us[i])] > _DOUBTFUL_PX),
-                   key=lambda i: -off[int(landmarks.times_us[i])])[:_OPEN]  # fmt: skip
+    worst = sorted((i for i in shown if off[i] > _DOUBTFUL_PX), key=lambda i: -off[i])[:_OPEN]
     embed = Embedder(lossless=False)
 
     def tile(index: int) -> str:
-        picture = by_time[int(landmarks.times_us[index])]
+        picture = shown_in[index]
         drawn = _drawn(picture, cameras[picture.frame.name], track, landmarks, index)
-        label = f"{picture.frame.name}, {picture.time_us / 1e6:.3f} s, {off[picture.time_us]:.1f} σ"
+        label = f"{picture.frame.name}, {picture.time_us / 1e6:.3f} s, {off[index]:.1f} σ"
         return figure(embed.image(np.asarray(drawn), label), label)
 
     grid = lambda indices: f'<div class="tiles">{"".join(map(tile, indices))}</div>'  # noqa: E731
@@ -85,6 +83,18 @@ def poses_page(
         + "</main>"
     )
     return document(f"{name}: poses", body, style="poses.css")
+
+
+def _pictures_of(landmarks: Landmarks, pictures: Sequence[SharpPicture]) -> dict[int, SharpPicture]:
+    """The picture of each row of landmarks that has one: of one time, one after the other."""
+    at: dict[int, list[SharpPicture]] = {}
+    for picture in pictures:
+        at.setdefault(picture.time_us, []).append(picture)
+    found: dict[int, SharpPicture] = {}
+    for index, time in enumerate(landmarks.times_us.tolist()):
+        if at.get(time):
+            found[index] = at[time].pop(0)
+    return found
 
 
 _SURE = (
