@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from evsplat.body import up_axis
+from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import export_run
@@ -82,6 +83,25 @@ def test_ply_of_a_run_is_the_instant_asked_for_in_metres(run, reconstruction):
     np.testing.assert_allclose(columns["z"], person.means[0, :, 2].numpy(), atol=1e-6)
 
 
+def test_a_pose_file_without_a_rate_is_exported_at_the_one_that_is_given(
+    run, tmp_path, monkeypatch
+):
+    path = tmp_path / "mine.npz"
+    poses = np.zeros((4, 3 * JOINTS["smpl"]))
+    np.savez(path, poses=poses, trans=np.zeros((4, 3)), betas=np.zeros(10))
+    with pytest.raises(ConfigError, match="give --motion-fps"):
+        export_run(run.path, "bvh", motion=str(path))
+    asked = []
+
+    def load(name, recorded, *, fps):
+        asked.append((name, fps))
+        return recorded
+
+    monkeypatch.setattr("evsplat.export.skeleton.load_motion_of", load)
+    export_run(run.path, "bvh", motion=str(path), motion_fps=20.0)
+    assert asked == [(str(path), 20.0)]
+
+
 @pytest.mark.parametrize(("up", "axis"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
 def test_up_turns_the_world_and_says_how(run, up, axis):
     _, plain = read_ply(export_run(run.path, "ply"))
@@ -114,6 +134,9 @@ def test_up_turns_the_world_and_says_how(run, up, axis):
         ("avatar", {"out": "a.ply"}, "ends in .html or is a folder"),
         ("avatar", {"motion": "swimming"}, "neither a file nor one of"),
         ("avatar", {"camera": "left"}, "only main, side"),
+        ("gltf", {"fps": 30.0}, "--fps: format gltf has no use"),
+        ("bvh", {"motion_fps": 30.0}, "--motion-fps: goes with --motion"),
+        ("bvh", {"motion": "walk", "motion_fps": 30.0}, "--motion-fps 30: motion walk has times"),
         ("html", {"fps": 0.1}, "--fps 0.1: expected a number within 1 and 120"),
     ],
 )

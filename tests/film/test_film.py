@@ -183,6 +183,11 @@ def test_a_held_moment_is_one_time_from_many_places(lamp, tmp_path):
         ({"show": "depth", "beside": True, "out": "folder"}, "--beside: a folder holds depth"),
         ({"motion_fps": 20.0}, "--motion-fps: goes with --motion"),
         ({"in_place": True}, "--in-place: goes with --motion"),
+        ({"motion": "walk", "motion_fps": 60.0}, "--motion-fps 60: motion walk has times of its"),
+        ({"motion": "walk", "motion_fps": 0.0}, "--motion-fps 0: expected a number within"),
+        ({"sensor": "davis346"}, "--sensor: goes with --show events"),
+        ({"event_hz": 400.0, "show": "depth"}, "--event-hz: goes with --show events"),
+        ({"what": "test", "slow": 4.0}, "--slow: films the sequence"),
         ({"at": 99.0}, "--at 99"),
         ({"at": 0.1, "slow": 2.0}, "--slow"),
         ({"what": "test", "path": "orbit"}, "--path: films the sequence"),
@@ -202,6 +207,14 @@ def test_contradicting_options_are_refused_before_anything_is_drawn(
         render_run(lamp.run, **options)
     assert not lamp.lamp.drawn
     assert sorted(p for p in tmp_path.iterdir() if p.name != "run") == before
+
+
+def test_the_folder_that_one_is_in_is_no_name_for_a_film(lamp, tmp_path, monkeypatch):
+    (tmp_path / "film").mkdir()
+    monkeypatch.chdir(tmp_path / "film")
+    with pytest.raises(ConfigError, match=r"--out \.: has no name of its own"):
+        render_run(lamp.run, out=".")
+    assert not list((tmp_path / "film").iterdir())
 
 
 def test_a_folder_in_the_way_of_kept_pictures_is_left_alone(lamp, tmp_path):

@@ -95,6 +95,13 @@ def test_pose_files_need_a_rate_and_follow_it(tmp_path):
     assert load_motion_of(str(path), recorded, fps=40).times_us.tolist()[-1] == 75_000
 
 
+@pytest.mark.parametrize("name", ["walk", str(find_motion("walk"))])
+def test_a_motion_with_times_of_its_own_takes_no_other_rate(name):
+    recorded = _recorded(Rotation.identity(), np.zeros(3))
+    with pytest.raises(ConfigError, match="--motion-fps 60: .*walk.* has times of its own"):
+        load_motion_of(name, recorded, fps=60.0)
+
+
 def test_unknown_motions_are_told_with_those_that_ship():
     recorded = _recorded(Rotation.identity(), np.zeros(3))
     with pytest.raises(DataError, match=r"--motion walc: .*backflip.*walk"):

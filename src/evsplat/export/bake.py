@@ -19,6 +19,7 @@ from evsplat.film import load_motion_of
 from evsplat.film.camera_path import check_camera
 from evsplat.methods.reconstruction import Parts
 from evsplat.models.at_rest import SkinnedGaussians
+from evsplat.options import ExportOptions
 from evsplat.render import Splats, render
 from evsplat.similarity import psnr
 from evsplat.training.reconstruction import GaussianReconstruction
@@ -55,14 +56,15 @@ def with_correctives(run: Run, gaussians: SkinnedGaussians, camera: str | None) 
 
 
 def export_avatar(
-    run: Run, path: Path, parts: Parts, camera: str | None, motion: str | None
+    run: Run, path: Path, parts: Parts, camera: str | None, options: ExportOptions
 ) -> Path:
     """Write the avatar of a run, say what it drops, and return its page."""
     capture, source = run.capture, run.reconstruction
     track = source.track
     clips: list[Clip] = []
-    if motion is not None:
-        clips.append(clip_of(Path(motion).stem, load_motion_of(motion, track)))
+    if options.motion is not None:
+        other = load_motion_of(options.motion, track, fps=options.motion_fps)
+        clips.append(clip_of(Path(options.motion).stem, other))
     gaussians = with_correctives(run, at_rest(run, camera), camera)
     avatar = avatar_of(gaussians, _elsewhere(source, gaussians))
     mids = [frame.mid_us for frame in capture.frames]

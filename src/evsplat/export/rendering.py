@@ -104,6 +104,8 @@ def _is_made_larger(film: Film, out: Path) -> bool:
 
 def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours: bool) -> None:
     """Refuse before hours of drawing what could not be written after them."""
+    if not out.name:
+        raise ConfigError(f"--out {out}: has no name of its own; give that of a folder or a file.")
     suffix = out.suffix.lower()
     if suffix in _OTHERS:
         raise ConfigError(

@@ -39,6 +39,7 @@ _SUFFIXES: dict[Kind, tuple[str, ...]] = {
     "skeleton": (".glb",),
 }
 """Endings that ``out`` may have; the first is the default. No ending: a folder."""
+_CLIP_FPS = 24.0
 
 
 def export_run(
@@ -80,14 +81,14 @@ def export_run(
     loaded = opened(run, device=options.device)
     if kind == "avatar":
         page = target or folder / "avatar"
-        return export_avatar(loaded, page, parts or "human", camera, options.motion)
+        return export_avatar(loaded, page, parts or "human", camera, options)
     if kind == "bvh" or kind == "skeleton":
         name = "recorded" if options.motion is None else Path(options.motion).stem
         file = target or folder / f"{name}{_SUFFIXES[kind][0]}"
-        return export_motion(loaded, file, kind, options.motion)
+        return export_motion(loaded, file, kind, options)
     if kind == "html":
         page = target or folder / "clip.html"
-        return export_clip(loaded, page, parts or "all", camera, options.fps)
+        return export_clip(loaded, page, parts or "all", camera, options.fps or _CLIP_FPS)
     return _export_instant(loaded, kind, target, options)
 
 
@@ -144,6 +145,7 @@ def _check_use(kind: Kind, options: ExportOptions) -> None:
         "--up": moving and options.up is not None,
         "--low-pass": moving and options.low_pass is not None,
         "--motion": kind != "avatar" and not skeletal and options.motion is not None,
+        "--fps": kind != "html" and options.fps is not None,
         "--parts and --camera": skeletal and (options.parts, options.camera) != (None, None),
     }
     for names, given_in_vain in unused.items():

@@ -16,6 +16,7 @@ from evsplat.export.formats import glb_bytes
 from evsplat.export.gaussians import facts_of, file_rotation, rest_track
 from evsplat.files import write_bytes, write_text
 from evsplat.film import load_motion_of
+from evsplat.options import ExportOptions
 from evsplat.options.runs import MotionKind
 from evsplat.training.run import Run
 
@@ -66,15 +67,15 @@ def file_motion(clip: Clip, body: Body, world_to_file: Float[np.ndarray, "3 3"])
     )
 
 
-def export_motion(run: Run, path: Path, kind: MotionKind, motion: str | None) -> Path:
+def export_motion(run: Run, path: Path, kind: MotionKind, options: ExportOptions) -> Path:
     """Write the recorded motion of a run, as the method corrected it, or another of its body."""
     source = run.reconstruction
-    if motion is None:
+    if options.motion is None:
         mids = [frame.mid_us for frame in run.capture.frames]
         clip, track = recorded_clip(source, (min(mids), max(mids))), source.track
     else:
-        track = load_motion_of(motion, source.track)
-        clip = clip_of(Path(motion).stem, track)
+        track = load_motion_of(options.motion, source.track, fps=options.motion_fps)
+        clip = clip_of(Path(options.motion).stem, track)
     made = file_motion(clip, track.body.to("cpu"), file_rotation(track, "gltf", None))
     if kind == "bvh":
         write_bvh(path, made)

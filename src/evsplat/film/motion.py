@@ -37,16 +37,21 @@ def load_motion_of(
     file does not say. ``in_place`` leaves out all travel along the floor.
 
     Raises:
+        ConfigError: ``fps`` is missing, or the motion has times of its own.
         DataError: no such motion, a file that cannot be read, a skeleton that is not recognised.
     """
-    if name in motions():
-        return place_motion(load_motion(find_motion(name)), recorded, up=_Z, in_place=in_place)
-    path = Path(name)
+    ships = name in motions()
+    path = Path(find_motion(name) if ships else name)
     if not path.exists():
         raise DataError(
             f"--motion {name}: neither a file nor one of {', '.join(motions())}; correct the name."
         )
-    if path.suffix.lower() in _MOTION_SUFFIXES:
+    if ships or path.suffix.lower() in _MOTION_SUFFIXES:
+        if fps is not None:
+            raise ConfigError(
+                f"--motion-fps {fps:g}: motion {name} has times of its own, expected a pose file; "
+                "leave it out."
+            )
         return place_motion(load_motion(path), recorded, up=_Z, in_place=in_place)
     sequence = read_poses(path)
     if fps is None and sequence.fps is None:
@@ -54,7 +59,7 @@ def load_motion_of(
             f"--motion {name}: the file does not say how many poses there are in a second; "
             "give --motion-fps."
         )
-    motion = skeleton_motion(replace(sequence, fps=fps or sequence.fps))
+    motion = skeleton_motion(replace(sequence, fps=sequence.fps if fps is None else fps))
     up = np.array(_UP[sequence.world]) if sequence.world in _UP else None
     return place_motion(motion, recorded, up=up, in_place=in_place)
 

@@ -39,7 +39,7 @@ class TrainOptions:
     """Settings to change, such as event_weight=0.2; see docs/settings.md."""
     resume: Flag = False
     """Go on from the last checkpoint in --out."""
-    seed: Annotated[int | None, option("S", default="0")] = None
+    seed: Annotated[int | None, Within(-(2**63), 2**63 - 1), option("S", default="0")] = None
     """Seed of every random number."""
     use: Annotated[Use | None, option("{training,everything}", default="training")] = None
     """everything trains on all that was recorded and holds nothing out for test figures."""
@@ -68,7 +68,10 @@ class TrainOptions:
             )
 
 
+MotionRate = Annotated[float | None, Within(0.01, 100_000), option("HZ", default="the file's")]
 Shown = Literal["rgb", "semantic", "depth", "events", "certainty"]
+
+_EVENT_HZ = 1000.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class Film:
     """orbit, swing, interpolate or a JSON file."""
     motion: Annotated[str | None, option("NAME", default="none")] = None
     """Another motion: walk, run, spin, dance_a ... or a motion or pose file."""
-    motion_fps: Annotated[float | None, option("HZ", default="the file's")] = None
+    motion_fps: MotionRate = None
     """Poses per second of a pose file."""
     in_place: Flag = False
     """Leave out the motion's travel along the floor."""
@@ -113,14 +116,22 @@ class Film:
     """Transparent where nothing is (.webp, .gif, PNG)."""
     sensor: Annotated[Sensor, option("NAME")] = "clean"
     """Event camera of --show events."""
-    event_hz: Annotated[float, Above(0), AtMost(100_000), option("HZ")] = 1000.0
+    event_hz: Annotated[float, Above(0), AtMost(100_000), option("HZ")] = _EVENT_HZ
     """Pictures per second that it is shown."""
 
     def __post_init__(self) -> None:
         check_options(self)
         changed = [f for f in ("path", "motion", "at", "seconds") if getattr(self, f) is not None]
+        if self.slow != 1:
+            changed.append("slow")
         if self.show == "events":
             changed.append("show events")
+        elif self.sensor != "clean" or self.event_hz != _EVENT_HZ:
+            option = "sensor" if self.sensor != "clean" else "event-hz"
+            raise ConfigError(
+                f"--{option}: goes with --show events, which simulates them; give it or leave "
+                f"--{option} out."
+            )
         if self.what == "test" and changed:
             raise ConfigError(
                 f"--{changed[0]}: films the sequence, not --what test; leave one out."
@@ -192,7 +203,9 @@ class ExportOptions:
     """Make up for a viewer that adds so many px^2, at the recording's size (docs/export.md)."""
     motion: Annotated[str | None, option("NAME", default="the recorded one alone")] = None
     """Another motion for avatar, bvh or skeleton, as 'evsplat render' takes it."""
-    fps: Annotated[float, Within(1, 120), option("HZ")] = 24.0
+    motion_fps: MotionRate = None
+    """Poses per second of a pose file."""
+    fps: Annotated[float | None, Within(1, 120), option("HZ", default="24")] = None
     """Pictures per second of html."""
     device: Device = "auto"
     """Device that computes."""
@@ -201,6 +214,8 @@ class ExportOptions:
         check_options(self)
         if self.time_s is not None and self.frame is not None:
             raise ConfigError("--time and --frame both say when; give one of them.")
+        if self.motion is None and self.motion_fps is not None:
+            raise ConfigError("--motion-fps: goes with --motion; name one or leave it out.")
         if self.canonical and (self.time_s is not None or self.frame is not None):
             raise ConfigError(
                 "--canonical is the person at rest, at no time; leave out --time, --frame."
