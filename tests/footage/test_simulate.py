@@ -175,6 +175,7 @@ def test_command_takes_preset_and_single_settings(
         (["--source-fps", "100", "--contrast", "0"], ["contrast_on is 0.0", "at least 0.01"]),
         (["--source-fps", "100", "--set", "shot=3"], ["Did you mean shot_hz?"]),
         (["--source-fps", "100", "--set", "shot_hz=much"], ["shot_hz", "'much'"]),
+        (["--source-fps", "100", "--seed", "-1"], ["--seed -1: expected", "0 or more"]),
         (["--source-fps", "100", "--preset", "davis"], ["davis346"]),
     ],
 )

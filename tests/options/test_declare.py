@@ -106,6 +106,21 @@ def test_options_load_no_torch():
     assert done.stdout == "False False\n", done.stderr
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"events": "source", "sensor": "evk4"}, "--sensor: goes with --events simulate"),
+        ({"events": "none", "contrast": 0.3}, "--contrast: goes with --events simulate"),
+        ({"interpolation": "none", "upsample": 4}, "--upsample: --interpolation none makes no"),
+        ({"seed": -1}, "--seed -1: expected an integer of at least 0"),
+    ],
+)
+def test_what_the_making_of_a_capture_would_pass_over_is_refused(changes, said):
+    with pytest.raises(ConfigError, match=said):
+        options.SynthesisSettings(**changes)
+    options.SynthesisSettings(recipe="zju-mocap-blur", events="source")
+
+
 def test_a_recipe_fills_in_what_is_not_given():
     recipe = options.SynthesisSettings(recipe="mmhpsd-blur", interpolation="flow", subframes=5)
     assert (recipe.interpolation, recipe.duty, recipe.contrast) == ("flow", None, 0.2)

@@ -297,6 +297,8 @@ def test_what_ships_has_its_licences():
         ({"exposure_ms": 50}, "shorten the exposure"),
         ({"width": 4}, "--width 4: expected an integer within 16 and 4096"),
         ({"fps": float("nan")}, "--fps nan"),
+        ({"seed": -1}, "--seed -1: expected an integer of at least 0"),
+        ({"orbit_deg": 60.0}, "--orbit 60: goes with --camera orbit"),
         ({"camera": "crane"}, "one of static, orbit, handheld"),
         ({"colour": "red"}, "colour: no such option"),
     ],

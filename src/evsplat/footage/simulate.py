@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from evsplat.errors import DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, SensorSettings, simulate_events, write_events
 from evsplat.footage import Footage, open_footage
 from evsplat.pictures import Transfer, decode, luminance
@@ -46,13 +46,16 @@ def simulate(
             ideal one with a threshold of 0.2.
         source_fps: Rate at which the pictures were taken; a folder needs it.
         transfer: Between coded values and linear light.
-        seed: Of everything random in the sensor.
+        seed: Of everything random in the sensor; 0 or more.
 
     Raises:
         DataError: Footage that cannot be read or has a single picture.
-        ConfigError: ``source_fps`` is missing or makes no sense, or the suffix names no format.
+        ConfigError: ``source_fps`` is missing or makes no sense, ``seed`` is below 0, or the suffix
+            names no format.
     """
     settings = settings or SensorSettings()
+    if seed < 0:
+        raise ConfigError(f"--seed {seed}: expected an integer, 0 or more.")
     footage = open_footage(source, source_fps, rate_option="--source-fps")
     steps_us = np.diff(footage.times_us)
     if not len(steps_us):

@@ -70,6 +70,7 @@ _PAPER = Recipe("super-slomo", duty=1.0, contrast=0.2)
 # The recorded events of MMHPSD carry no polarity, so they are simulated as well.
 RECIPES = {"zju-mocap-blur": _PAPER, "mmhpsd-blur": _PAPER}
 """Recipes of the paper's data sets, made from ZJU-MoCap and MMHPSD, by name."""
+_UPSAMPLE = 8
 _EXPOSURES = ("exposure_us", "duty", "subframes")
 
 
@@ -92,7 +93,7 @@ class SynthesisSettings:
     """Their share of the time between frames."""
     subframes: Annotated[int | None, Above(0), option("K", default="by --duty")] = None
     """Frames are means of K sub-frames."""
-    upsample: Annotated[int, AtLeast(1), option("N")] = 8
+    upsample: Annotated[int, AtLeast(1), option("N")] = _UPSAMPLE
     """Sub-frames per source picture."""
     interpolation: Annotated[Interpolation | None, option("KIND", default="flow")] = None
     """Pictures in between: flow, super-slomo or none."""
@@ -102,7 +103,7 @@ class SynthesisSettings:
     """Event camera, as of 'evsplat simulate'."""
     contrast: Annotated[float | None, AtLeast(0.01), option("C", default="the sensor's")] = None
     """Contrast threshold of events."""
-    seed: Annotated[int, option("N")] = 0
+    seed: Annotated[int, AtLeast(0), option("N")] = 0
     """Seed of all noise."""
     read_noise: Annotated[float, Within(0, 1), option("SIGMA")] = 0.0
     """Noise of frames, in linear light."""
@@ -117,9 +118,17 @@ class SynthesisSettings:
         if len(exposures) > 1:
             raise ConfigError(f"{' and '.join(exposures)}: give one length of the exposures.")
         recipe = _NONE if self.recipe is None else RECIPES[self.recipe]
+        given = self.contrast not in (None, recipe.contrast)
+        if self.events != "simulate" and (self.sensor != "clean" or given):
+            name = "contrast" if self.sensor == "clean" else "sensor"
+            raise ConfigError(f"--{name}: goes with --events simulate; leave --{name} out.")
         for name, value in asdict(recipe).items():
             if getattr(self, name) is None and not (name == "duty" and exposures):
                 object.__setattr__(self, name, value)
+        if self.interpolation == "none" and self.upsample != _UPSAMPLE:
+            raise ConfigError(
+                "--upsample: --interpolation none makes no sub-frames in between; leave one out."
+            )
 
     @property
     def factor(self) -> int:
@@ -129,6 +138,7 @@ class SynthesisSettings:
 
 CameraMotion = Literal["static", "orbit", "handheld"]
 NovelViews = Literal["test", "all", "none"]
+_ORBIT_DEG = 30.0
 PoseNoise = Literal["none", "mocap", "estimated", "estimated-blurry"]
 
 
@@ -160,7 +170,7 @@ class StageSettings:
     """Leave out travel across the floor."""
     camera: Annotated[CameraMotion, option("HOW")] = "static"
     """Tripod (static), arc round the person (orbit) or handheld."""
-    orbit_deg: Annotated[float, Within(-360, 360), option("DEG", name="orbit")] = 30.0
+    orbit_deg: Annotated[float, Within(-360, 360), option("DEG", name="orbit")] = _ORBIT_DEG
     """Arc of an orbiting camera in all."""
     shadows: Annotated[Flag, option(name="shadow")] = True
     """Leave out the person's shadow on the room."""
@@ -188,13 +198,18 @@ class StageSettings:
     """Frames with sharp pictures of two more cameras: test, all or none."""
     subframe_hz: Annotated[float, Within(1000, 100_000), option("HZ")] = 1000.0
     """Pictures per second that blur and events are made of, at least."""
-    seed: Annotated[int, option("S")] = 0
+    seed: Annotated[int, AtLeast(0), option("S")] = 0
     """Seed of every random number."""
 
     def __post_init__(self) -> None:
         check_options(self)
         if self.height is None:
             object.__setattr__(self, "height", self.width)
+        if self.camera != "orbit" and self.orbit_deg != _ORBIT_DEG:
+            raise ConfigError(
+                f"--orbit {self.orbit_deg:g}: goes with --camera orbit; name it or leave --orbit "
+                "out."
+            )
         if self.exposure_ms > 1000 / self.fps + 1e-9:
             raise ConfigError(
                 f"--exposure-ms {self.exposure_ms:g}: a frame comes every {1000 / self.fps:g} ms "
