@@ -156,6 +156,8 @@ def test_bad_options_are_named(tiny_capture: Factory, tmp_path: Path) -> None:
         ({"method": "sam"}, "sam.*background"),
         ({"method": "background", "threshold": 2.0}, "between 0 and 1"),
         ({"method": "silhouette", "margin_px": -1.0}, "0 or more"),
+        ({"method": "silhouette", "margin_px": float("nan")}, "0 or more"),
+        ({"method": "silhouette", "margin_px": float("inf")}, "0 or more"),
     ):
         with pytest.raises(ConfigError, match=words):
             mask_capture(path, tmp_path / "out", **options)

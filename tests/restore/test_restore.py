@@ -112,8 +112,9 @@ def test_bad_input_leaves_nothing_behind(tiny_capture: Factory, tmp_path: Path) 
     path, out = tiny_capture(), tmp_path / "out" / "sharp"
     with pytest.raises(ConfigError, match="nothing.*edi"):
         restore_capture(path, out, method="nothing")
-    with pytest.raises(ConfigError, match="above 0"):
-        restore_capture(path, out, contrast_threshold=(0.2, 0.0))
+    for wrong in (0.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="above 0"):
+            restore_capture(path, out, contrast_threshold=(0.2, wrong))
     with pytest.raises(DataError, match="already exists"):
         restore_capture(path, path)
     Image.new("RGB", (5, 5)).save(path / "images" / "0004.png")

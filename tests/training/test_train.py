@@ -237,7 +237,8 @@ def test_non_finite_steps_are_skipped_counted_and_finally_stop(tiny_capture, cap
 
 def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_path):
     capture = tiny_capture(frames=10)
-    out = tmp_path / "run"
+    out, config = tmp_path / "run", tmp_path / "config.yaml"
+    config.write_text("policy:\n")
     calls = [
         ({"method": "papr"}, ConfigError, "Did you mean paper"),
         ({"iterations": 0}, ConfigError, "--iterations 0"),
@@ -245,7 +246,9 @@ def test_wrong_calls_are_refused_before_anything_is_written(tiny_capture, tmp_pa
         ({"device": "cuda"}, BackendError, "--device cuda"),
         ({"device": "gpu"}, ConfigError, "expected one of auto, cpu, cuda"),
         ({"overrides": ("event_wieght=1",)}, ConfigError, "Did you mean event_weight"),
+        ({"seed": 2**64}, ConfigError, "--seed 18446744073709551616: expected an integer within"),
         ({"resume": True}, DataError, "not a run folder"),
+        ({"config": config, "use": "everything"}, ConfigError, "policy is None; expected a sect"),
     ]
     for arguments, kind, message in calls:
         with pytest.raises(kind, match=message):

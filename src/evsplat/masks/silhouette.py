@@ -1,5 +1,6 @@
 """The posed body's silhouette as a person mask."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -25,10 +26,10 @@ class PosedBody:
         """``margin_px``: widen the silhouette by this many pixels on all sides.
 
         Raises:
-            ConfigError: the margin is below 0.
+            ConfigError: the margin is below 0 or not finite.
             DataError: the capture has no body poses.
         """
-        if margin_px < 0:
+        if not 0 <= margin_px < math.inf:
             raise ConfigError(f"margin {margin_px:g}: expected pixels, 0 or more.")
         self._track = load_body_track(capture)
         self._margin_px = margin_px

@@ -1,5 +1,6 @@
 """Event double integral as a restorer (`evsplat.events.edi`)."""
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -31,11 +32,12 @@ class Edi:
         Raises:
             DataError: The capture has no events or no polarity, or no thresholds and none can be
                 estimated.
-            ConfigError: A threshold is not above 0.
+            ConfigError: A threshold is not above 0 and finite.
         """
         require_signed_events(capture, "the event double integral (edi)")
         self._transfer: Transfer = transfer or capture.transfer(capture.frames[0])
-        if contrast_threshold is not None and min(contrast_threshold) <= 0:
+        given = contrast_threshold or ()
+        if not all(0 < threshold < math.inf for threshold in given):
             raise ConfigError(
                 f"contrast threshold {contrast_threshold}: expected two numbers above 0, C+ and C-."
             )

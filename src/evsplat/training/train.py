@@ -242,7 +242,9 @@ def _new(capture: Capture, options: TrainOptions) -> _Start:
     folder = new_run_folder(capture, method) if out is None else RunFolder(Path(out))
     values = override(values, options.overrides)
     if options.use is not None:
-        values.setdefault("policy", {})["use"] = options.use
+        policy = values.setdefault("policy", {})
+        if isinstance(policy, dict):  # else it is refused below
+            policy["use"] = options.use
     where = "--set" if config is None else str(config)
     settings = method_config(method, values, where=where)
     return _Start(folder, method, settings, options.seed or 0)
