@@ -18,6 +18,11 @@ def test_a_shell_reads_the_words_that_were_meant(name: str) -> None:
     assert shlex.split(command(*words)) == ["evsplat", *map(str, words)]
 
 
+def test_a_path_that_begins_with_a_dash_is_no_option() -> None:
+    words = ["view", Path("./-run"), Path("--out"), "--port"]
+    assert command(*words) == "evsplat view ./-run ./--out --port"
+
+
 @pytest.mark.parametrize(
     ("called", "shown"),
     [

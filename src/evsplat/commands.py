@@ -10,7 +10,13 @@ def command(*words: Path | str) -> str:
 
     The program is named as it was called where that is a path to it, such as ``.venv/bin/evsplat``.
     """
-    return shlex.join([_program(), *map(str, words)])
+    return shlex.join([_program(), *map(_word, words)])
+
+
+def _word(word: Path | str) -> str:
+    """A path that begins with a dash would be taken for an option."""
+    text = str(word)
+    return f"./{text}" if isinstance(word, Path) and text.startswith("-") else text
 
 
 def _program() -> str:

@@ -42,6 +42,9 @@ def test_missing_capture_is_one_message_and_code_2(capsys, tmp_path, verb):
         ("train c --set A=1 --out o --set B=2 C=-3 -h", "train c --set A=1 B=2 C=-3 --out o -h"),
         ("train --set A=1 B=2 --seed 3", "train --set A=1 B=2 --seed 3"),
         ("inspect c --out o", "inspect c --out o"),
+        ("train c --set=A=1 --seed 3 --set B=2", "train c --set A=1 B=2 --seed 3"),
+        ("bench s --only a --seeds 1 --only b", "bench s --only a b --seeds 1"),
+        ("bench s --seeds 1 -2 --jobs 1", "bench s --seeds 1 -2 --jobs 1"),
     ],
 )
 def test_settings_given_one_by_one_all_count(given, meant):

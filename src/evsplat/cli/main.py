@@ -41,6 +41,7 @@ _VERBS: dict[str, Callable[..., Any]] = {
     "bench": runs.Bench,
 }
 """A function works as it is called; an object is called for its work."""
+_LISTS_OF_BENCH = ("--captures", "--add", "--seeds", "--only")
 _DESCRIPTION = (
     "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"
     "Start with 'evsplat demo'; 'evsplat VERB --help' tells more."
@@ -101,21 +102,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _gathered(arguments: Sequence[str]) -> list[str]:
-    """``--set A=1 --set B=2`` as ``--set A=1 B=2``: the parser would keep the last one alone."""
-    kept: list[str] = []
-    settings: list[str] = []
-    place: int | None = None
-    follows = False
+    """``--set A=1 --set B=2`` as ``--set A=1 B=2``: the parser would keep the last one alone.
+
+    So with the lists of ``bench``, and with ``--set=A=1``.
+    """
+    lists = {"--set", *(_LISTS_OF_BENCH if "bench" in arguments[:1] else ())}
+    kept: list[list[str]] = []
+    gathered: dict[str, list[str]] = {}
+    last: list[str] | None = None
     for argument in arguments:
-        if argument == "--set":
-            place = len(kept) if place is None else place
-            follows = True
-        elif follows and not argument.startswith("-"):
-            settings.append(argument)
+        name, equals, value = argument.partition("=")
+        if name in lists:
+            if name not in gathered:
+                gathered[name] = [name]
+                kept.append(gathered[name])
+            last = gathered[name]
+            last += [value] if equals else []
+        elif last is not None and not argument.startswith("-"):
+            last.append(argument)
         else:
-            follows = False
-            kept.append(argument)
-    return kept if place is None else [*kept[:place], "--set", *settings, *kept[place:]]
+            last = None
+            kept.append([argument])
+    return [word for words in kept for word in words]
 
 
 def _in_a_line(verb: Callable[..., Any]) -> Callable[[], None]:
