@@ -134,6 +134,7 @@ BAD = {
     "18 points": lambda path: write_npz(path / "a.npz", points(18)),
     "holds 6 frames": lambda path: write_npz(path / "a.npz", points(17)),
     "beyond": lambda path: write_npz(path / "a.npz", points(17) * [1e9, 1, 1]),
+    "not shares": lambda path: write_npz(path / "a.npz", points(17) / [500, 500, 1]),
     "expected confidences": lambda path: write_npz(path / "a.npz", points(17) * [1, 1, 90]),
     "shows nobody": lambda path: write_npz(path / "a.npz", points(17) * 0),
     "shape": lambda path: write_npz(path / "a.npz", points(17)[0]),

@@ -11,6 +11,7 @@ import torch
 from tests.posing.moving import CAMERA, landmarks
 
 from evsplat.capture import Policy, load_body_track, load_capture, validate_capture
+from evsplat.capture.distortion import Distortion
 from evsplat.errors import ConfigError, DataError
 from evsplat.options import PoseSearch
 from evsplat.posing import find, find_poses
@@ -296,3 +297,23 @@ def test_key_points_of_cameras_with_one_trigger_are_each_seen_through_their_own(
     wanted = [capture.camera(frame) for frame in frames if frame.split == "train"]
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one.world_to_camera, other.world_to_camera)
+
+
+def test_key_points_of_a_lens_that_distorts_lie_where_the_pictures_are_read(unposed, rng):
+    """They were found in the pictures as recorded."""
+    path, points = unposed
+    straight = np.load(points)
+    document = json.loads((path / "capture.json").read_text())
+    camera = document["cameras"]["main"]
+    coefficients = (rng.uniform(-0.3, 0.3, 4) * (1, 0.2, 0.02, 0.02)).tolist()
+    camera["distortion"] = {"model": "opencv", "coefficients": coefficients}
+    (path / "capture.json").write_text(json.dumps(document))
+    K = np.array(camera["K"], np.float64)
+    lens = Distortion(camera["width"], camera["height"], K, tuple(coefficients))
+    np.save(points, np.concatenate((lens.distort(straight[..., :2]), straight[..., 2:]), -1))
+    capture = load_capture(path, needs_body=False)
+    found = find._landmarks(capture.for_training(Policy()), (), points)
+    train = [frame.split == "train" for frame in capture.frames]
+    assert np.array_equal(found.seen, straight[train][..., 2])
+    there = found.seen > 0
+    np.testing.assert_allclose(found.places[there], straight[train][..., :2][there], atol=1e-3)

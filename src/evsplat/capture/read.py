@@ -127,6 +127,13 @@ class CaptureReader:
         """True where the lens of a camera distorts, which reading pictures and events undoes."""
         return camera in self._metadata.distortions
 
+    def undistort(
+        self, camera: str, pixels: Float[np.ndarray, "*batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Where pixels of a recorded picture are in the one that is read; NaN where nowhere."""
+        lens = self._metadata.distortions.get(camera)
+        return pixels if lens is None else lens.undistort(pixels)
+
     @property
     def has_others_masks(self) -> bool:
         """True where a frame has a mask that `evsplat masks` did not make."""

@@ -142,6 +142,12 @@ class TrainingCapture:
         """True where the lens of a camera distorts (`Capture.is_distorted`)."""
         return self._source.is_distorted(camera)
 
+    def undistort(
+        self, camera: str, pixels: Float[np.ndarray, "*batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Where pixels of a recorded picture are in the one that is read (`Capture.undistort`)."""
+        return self._source.undistort(camera, pixels)
+
     @property
     def is_static_camera(self) -> bool:
         """True where all frames come from one camera that stands still."""

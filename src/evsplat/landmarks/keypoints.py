@@ -14,6 +14,7 @@ SIGMA_SHARE = 0.012
 """Error of a point that is surely seen, as a share of the person's height in the picture."""
 LEAST_SEEN = 0.05
 _LARGEST = 1e6
+_LARGEST_SHARE = 2.0
 
 
 def read_keypoints(path: Path | str, times_us: Sequence[int]) -> Landmarks:
@@ -26,7 +27,8 @@ def read_keypoints(path: Path | str, times_us: Sequence[int]) -> Landmarks:
     set of points it is, their number says.
 
     Raises:
-        DataError: missing, damaged, another count of frames or points, several people, or nobody.
+        DataError: missing, damaged, not in pixels, another count of frames or points, several
+            people, or nobody.
     """
     path = Path(path)
     values = read_points(path)
@@ -42,6 +44,11 @@ def read_keypoints(path: Path | str, times_us: Sequence[int]) -> Landmarks:
     if np.abs(values).max(initial=0) > _LARGEST:
         raise DataError(
             f"{path}: holds values beyond {_LARGEST:g}, expected pixels; the file is damaged."
+        )
+    if known.any() and np.abs(values[..., :2]).max() <= _LARGEST_SHARE:
+        raise DataError(
+            f"{path}: all places lie within {_LARGEST_SHARE:g} of 0, expected pixels, not shares "
+            "of the picture; multiply x with its width and y with its height."
         )
     confidence = values[..., 2] if values.shape[2] == 3 else np.ones(values.shape[:2])
     if confidence.min(initial=0) < 0 or confidence.max(initial=0) > 1.5:

@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -248,8 +248,18 @@ def _landmarks(
         return find_landmarks(capture, pictures, network=LandmarkNetwork())
     frames = sorted(capture.frames, key=lambda frame: frame.mid_us)
     points = read_keypoints(keypoints, [frame.mid_us for frame in frames])
+    points = _as_read(capture, frames, points)
     # Those of held-out frames were found in pictures that are not to be seen.
     return points.of_pictures(np.array([frame.split == "train" for frame in frames]))
+
+
+def _as_read(capture: TrainingCapture, frames: Sequence[Frame], points: Landmarks) -> Landmarks:
+    """Points of the pictures as recorded, in those that are read, whose lens does not distort."""
+    pairs = zip(frames, points.places, strict=True)
+    places = np.stack([capture.undistort(frame.camera, found) for frame, found in pairs])
+    inside = np.isfinite(places).all(-1)
+    places = np.where(inside[..., None], places, 0.0)
+    return replace(points, places=places, seen=np.where(inside, points.seen, 0.0))
 
 
 def _with_somebody(
