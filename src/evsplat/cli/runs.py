@@ -246,9 +246,7 @@ class Export:
 
     ply, spz, splat and gltf hold the Gaussians of one instant.
 
-    html is a page that plays the recording in 3D.
-
-    avatar is a page with a person to play and to pose.
+    html is a page that plays the recording in 3D, avatar one with a person to pose.
 
     bvh and skeleton (glTF) hold the motion alone.
     """

@@ -179,9 +179,7 @@ class ExportOptions:
 
     out: Annotated[Path | None, option("PATH", default="in RUN/exports")] = None
     """The file to write; avatar: a page NAME.html, or a new folder."""
-    time_s: Annotated[
-        float | None, option("S", default="the middle of the recording", name="time")
-    ] = None
+    time_s: Annotated[float | None, option("S", default="the middle", name="time")] = None
     """Seconds from the first mid-exposure."""
     frame: Annotated[str | None, option("NAME", default="see --time")] = None
     """The mid-exposure of this frame."""
