@@ -12,6 +12,7 @@ import evsplat
 from evsplat.cli import main
 from evsplat.cli.main import _gathered
 from evsplat.shipped import demo_capture
+from evsplat.training_sign import training_in
 
 VERBS = ("demo", "doctor", "simulate", "synthesize", "stage", "inspect", "masks", "poses")
 VERBS += ("restore", "settings", "train", "evaluate", "report", "render", "view", "export", "bench")
@@ -85,6 +86,7 @@ def test_folder_that_is_no_run_is_one_message_and_code_2(capsys, tmp_path, verb)
         (["--iterations", "0"], ["--iterations 0", "at least 1"]),
         (["--max-minutes", "-1"], ["--max-minutes -1", "above 0"]),
         (["--threads", "0"], ["--threads 0", "at least 1"]),
+        (["--view", "--port", "99999"], ["--port 99999", "within 1 and 65535"]),
         (["--resume"], ["no such run folder|not a run folder|config.yaml"]),
     ],
 )
@@ -271,6 +273,16 @@ def test_view_of_a_folder_that_is_no_run_is_one_sentence(capsys, tmp_path):
     assert main(["view", str(tmp_path)]) == 2
     message = capsys.readouterr().err
     assert str(tmp_path) in message and "config.yaml" in message
+
+
+@pytest.mark.parametrize("address", [["--port", "65536"], ["--host", "no.such.host.invalid"]])
+def test_view_of_no_address_is_refused_before_a_run_is_waited_for(capsys, tmp_path, address):
+    pytest.importorskip("viser", reason="needs the extra view: pip install 'evsplat[view]'")
+    with training_in(tmp_path):  # which has not come to its first step
+        assert main(["view", str(tmp_path), *address]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"evsplat: {' '.join(address)}: ")
+    assert "waiting" not in printed.out
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,13 @@ def test_file_names_say_what_is_in_them():
     )
 
 
+def test_films_of_two_cameras_have_two_names_whatever_the_cameras_are_called():
+    cameras = (None, "cam.1", "cam.2", "cam", "rgb", "all")
+    names = [Film(camera=camera).file_name() for camera in cameras]
+    assert len(set(names)) == len(cameras)
+    assert Film(camera="left", path="paths/slow.json").file_name() == "sequence-left-slow.mp4"
+
+
 @pytest.mark.parametrize("path", ["orbit", "swing"])
 def test_the_camera_turns_about_the_vertical_of_the_recording_whatever_the_motion(
     tiny_capture, monkeypatch, path

@@ -164,6 +164,24 @@ def test_a_browser_that_cannot_be_drawn_takes_nothing_from_the_others(scheduler,
     assert said == ["A picture could not be drawn or saved (ValueError: no number)."]
 
 
+def test_a_full_picture_that_failed_is_asked_for_again_after_a_while(scheduler):
+    tried = []
+
+    class FailsOnce(Client):
+        def render(self, request, *, draft):
+            tried.append((scheduler._clock.now, draft))
+            if [draft for _, draft in tried].count(False) == 1 and not draft:
+                raise MemoryError("no memory just now")
+            super().render(request, draft=draft)
+
+    client = FailsOnce()
+    scheduler.add(client)
+    _run(scheduler, 10)
+    assert client.drawn == [("", "view", True), ("", "view", False)]
+    (_, _), (failed, _), (again, _) = tried
+    assert again - failed == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("nanoseconds_per_pixel", [20, 100, 300])
 def test_drafts_come_to_take_the_target(nanoseconds_per_pixel):
     resolution = DraftResolution(target_s=0.04)

@@ -20,6 +20,7 @@ from evsplat.options.declare import (
     Port,
     RunFolder,
     Threads,
+    check_options,
     option,
 )
 from evsplat.options.inputs import Input, check_run_folder, check_run_or_training
@@ -86,6 +87,9 @@ class Train:
     view: Flag = False
     """Show the run in the browser while it is trained, and afterwards until Ctrl-C."""
     port: Port = 8080
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def __call__(self) -> None:
         from evsplat.cli.viewer_process import ViewerProcess
@@ -226,6 +230,9 @@ class View:
     device: Device = "auto"
     """Device that draws."""
     threads: Threads = None
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def __call__(self) -> None:
         from evsplat.view import view_run

@@ -11,7 +11,7 @@ import tyro
 
 from evsplat.errors import ConfigError
 from evsplat.options.inputs import Input, check_capture_folder, check_run_folder
-from evsplat.ranges import AtLeast, Range, expected
+from evsplat.ranges import AtLeast, Range, Within, expected
 
 Options = TypeVar("Options")
 
@@ -61,7 +61,11 @@ RunFolder = Annotated[
     option("RUN", "Run folder written by 'evsplat train'."),
     Input(check_run_folder),
 ]
-Port = Annotated[int, option("PORT", "Where to listen.", default="8080, or the next free one")]
+Port = Annotated[
+    int,
+    Within(1, 65535),
+    option("PORT", "Where to listen.", default="8080, or the next free one"),
+]
 Threads = Annotated[int | None, AtLeast(1), option("N", "CPU threads.", default="all cores")]
 NewRun = Annotated[
     Path | None, option("RUN", "Folder of the run.", default="runs/CAPTURE/METHOD/TIME")

@@ -157,9 +157,12 @@ class Film:
 
     def file_name(self) -> str:
         """Name of the film in a run's ``renders/``."""
-        said = [self.parts, self.camera, self.path, self.motion, self.show]
         words: list[str] = [self.what]
-        words += [Path(word).stem for word in said if word not in (None, "all", "rgb")]
+        words += [] if self.parts == "all" else [self.parts]
+        # No path and taken whole: there may be cam.1 and cam.2, or one that is called rgb.
+        words += [] if self.camera is None else [self.camera]
+        words += [Path(path).stem for path in (self.path, self.motion) if path is not None]
+        words += [] if self.show == "rgb" else [self.show]
         words += [] if self.at is None else [f"at-{self.at:g}s"]
         words += [name for name in ("transparent", "beside") if getattr(self, name)]
         ending = {"test": ""}.get(self.what, ".webp" if self.transparent else ".mp4")

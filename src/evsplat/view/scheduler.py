@@ -153,8 +153,10 @@ class RenderScheduler:
             return None
         if now - state.changed_s < SETTLED_S:
             return state.changed_s + SETTLED_S - now
-        state.is_final, state.drawn_s = True, now
+        # Also where it fails, after which it is asked for again, but not at once.
+        state.drawn_s, state.changed_s = now, now + _AFTER_FAILURE_S - SETTLED_S
         state.client.render(request, draft=False)
+        state.is_final = True
         return 0.0
 
     def _run(self) -> None:

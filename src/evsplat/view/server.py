@@ -124,6 +124,7 @@ class Viewer:
 def serve(paths: Sequence[Path | str], host: str, port: int, device: str) -> None:
     """Do the work of `evsplat.view.view_run`."""
     folders = [Path(path) for path in paths]
+    _free_port(host, port)  # what cannot be had is refused before a run is waited for and loaded
     following = any(map(is_training, folders))
     if following:
         # The training's GPU, if it has one, is not to be shared.
