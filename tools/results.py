@@ -9,10 +9,11 @@ docs/results/SUITE`` and by benchmarks/convergence.py.
 """
 
 import argparse
+import itertools
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
@@ -92,36 +93,61 @@ def trio(records: Records, row: str, capture: str) -> str:
     return text + (f" (± {max(spreads):.2f})" if spreads else "")
 
 
-def methods(records: Records, longer: Records, names: Sequence[str] = ()) -> str:
-    """Every row, or the named ones, on the captures that all methods are compared on.
+@dataclass(frozen=True)
+class _Line:
+    """A line of the table of methods."""
+
+    title: str
+    row: str
+    """The row's name in the suite."""
+    places: list[tuple[Records, str, str]]
+    """For every compared capture: the records, the row and the capture that it is of."""
+    from_suite: bool
+    """Whether it is of the suite's own lengths, which every row has."""
+
+
+def methods(records: Records, longer: Records) -> str:
+    """Every row on the captures that all methods are compared on.
 
     Below a row stands the same of ``longer`` runs, where every capture has one.
     """
+    return _table(records, _every_length(records, longer))
+
+
+def at_knee(records: Records, longer: Records) -> str:
+    """The rows of the short table, each on every capture with as many steps as pay."""
+    rule = (
+        "Steps are those of each method at its knee on each capture, the first length whose "
+        f"doubling brings less than {GAIN_DB} dB of the crop, or the longest that has run."
+    )
+    return _table(records, _at_their_knees(records, longer), rule)
+
+
+def _table(records: Records, rows: Iterable[_Line], *remarks: str) -> str:
+    """Lines with their figures; ``remarks`` stand below with what all figures have in common."""
     lines = [
         f"| method | steps | {' | '.join(COMPARED)} | CPU minutes |",
         f"|---|---:|{'---|' * len(COMPARED)}---:|",
     ]
     missing = []
-    for of, row, title, captures in _rows(records, longer):
-        if names and row.name not in names:
-            continue
-        figures = [trio(of, row.name, capture) for capture in captures]
+    for line in rows:
+        figures = [trio(*place) for place in line.places]
         gaps = [name for name, figure in zip(COMPARED, figures, strict=True) if figure == "–"]
-        if gaps and of is records:
+        if gaps and line.from_suite:
             where = "" if len(gaps) == len(COMPARED) else f" on {', '.join(gaps)}"
-            missing.append(f"`{row.name}`{where}")
+            missing.append(f"`{line.row}`{where}")
         if len(gaps) == len(COMPARED):
             continue
-        steps = of.figure(row.name, lambda r: r["iteration"], captures)
-        seconds = of.figure(row.name, lambda r: r.get("train_cpu_seconds"), captures)
+        seconds = _of_places(line, lambda record: record.get("train_cpu_seconds"))
         lines.append(
-            f"| {title} | {f'{steps.mean:,.0f}' if steps else '–'} | {' | '.join(figures)} | "
-            f"{f'{seconds.mean / 60:.1f}' if seconds else '–'} |"
+            f"| {line.title} | {_steps(line)} | {' | '.join(figures)} | "
+            f"{f'{fmean(seconds) / 60:.1f}' if seconds else '–'} |"
         )
     notes = [
         "PSNR in dB of full frame / person crop / person mask, protocol `standard`, "
         f"{_test_frames(records)} test frames; one seed where no ± follows, which is the largest "
         f"standard deviation of the three over seeds. {STRICT_TERMS}",
+        *remarks,
         *machines(records),
         "CPU minutes are the processor's of the training alone, which ran beside other work; the "
         "mean over what the row has. The commit of every cell is in docs/results.md.",
@@ -131,16 +157,60 @@ def methods(records: Records, longer: Records, names: Sequence[str] = ()) -> str
     return "\n".join([*lines, "", " ".join(notes)])
 
 
-def _rows(records: Records, longer: Records) -> Iterator[tuple[Records, SuiteRow, str, list[str]]]:
-    """Rows, their records, titles and captures; again those that ran longer or by found poses."""
+def _steps(line: _Line) -> str:
+    """Training steps, of each capture where they differ."""
+    found = [f"{steps:,.0f}" for steps in _of_places(line, lambda record: record["iteration"])]
+    return " / ".join(found if len(set(found)) > 1 else found[:1]) or "–"
+
+
+def _of_places(line: _Line, value: Callable[[Record], float | None]) -> list[float]:
+    """The mean of a value over the seeds of each place that has it."""
+    figures = [of.figure(row, value, [capture]) for of, row, capture in line.places]
+    return [figure.mean for figure in figures if figure]
+
+
+def _line(of: Records, row: SuiteRow, captures: Sequence[str], said: str = "") -> _Line:
+    places = [(of, row.name, capture) for capture in captures]
+    return _Line(title_of(of, row, captures) + said, row.name, places, from_suite=False)
+
+
+def _every_length(records: Records, longer: Records) -> Iterator[_Line]:
+    """All rows; again those that ran longer or by found poses."""
     for row in records.plan.suite.rows:
-        yield records, row, title_of(records, row, COMPARED), list(COMPARED)
+        yield replace(_line(records, row, COMPARED), from_suite=True)
         if all(longer.of(capture, row.name) for capture in COMPARED):
-            yield longer, row, title_of(longer, row, COMPARED), list(COMPARED)
-        for end, words in FOUND.items():
-            found = [capture + end for capture in COMPARED]
-            if any(records.of(capture, row.name) for capture in found):
-                yield records, row, f"{title_of(records, row, found)}; {words}", found
+            yield _line(longer, row, COMPARED)
+        yield from _by_found_poses(records, row)
+
+
+def _at_their_knees(records: Records, longer: Records) -> Iterator[_Line]:
+    """The rows for users at the knee of each capture; again those by found poses."""
+    for row in (row for row in records.plan.suite.rows if row.name in FOR_USERS):
+        places = [(*_knee_of(records, longer, row.name, capture), capture) for capture in COMPARED]
+        yield replace(_line(records, row, COMPARED), places=places, from_suite=True)
+        yield from _by_found_poses(records, row)
+
+
+def _by_found_poses(records: Records, row: SuiteRow) -> Iterator[_Line]:
+    for end, words in FOUND.items():
+        found = [capture + end for capture in COMPARED]
+        if any(records.of(capture, row.name) for capture in found):
+            yield _line(records, row, found, f"; {words}")
+
+
+def _knee_of(records: Records, longer: Records, name: str, capture: str) -> tuple[Records, str]:
+    """Records and row of the first length that a doubling improves by too little, or the last."""
+    crop = metric("standard", "person_crop", "psnr")
+    rows = [(records, name), *((longer, row) for row in _lengths(longer, name))]
+    run = [(of, row) for of, row in rows if of.of(capture, row)] or rows[:1]
+    means = [figure.mean for of, row in run if (figure := of.figure(row, crop, [capture]))]
+    pays = (after - before >= GAIN_DB for before, after in itertools.pairwise(means))
+    return run[sum(1 for _ in itertools.takewhile(bool, pays))]
+
+
+def _lengths(longer: Records, name: str) -> list[str]:
+    """Rows that ran a row of the suite for longer, as `LONGER` has them: from short to long."""
+    return [row.name for row in longer.plan.suite.rows if _STEPS.sub("", row.name) == name]
 
 
 def _test_frames(records: Records) -> str:
@@ -285,7 +355,7 @@ def texts() -> dict[str, str]:
     longer = kept_records(LONGER)
     return {
         "methods": methods(stage, longer),
-        "for-users": methods(stage, longer, FOR_USERS),
+        "for-users": at_knee(stage, longer),
         "captures": captures(stage),
         "grid": grid(drawn),
         "grid-summary": grid_summary(drawn),
