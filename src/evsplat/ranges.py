@@ -39,6 +39,10 @@ def Within(low: float, high: float) -> Range:
     return Range(f"within {low} and {high}", lambda number: low <= number <= high)
 
 
+SEEDS = Within(-(2**63), 2**63 - 1)
+"""Seeds of a training: what a generator of PyTorch takes."""
+
+
 @dataclass(frozen=True)
 class ReadIf:
     """Condition under which a setting, or all of a section, is read at all."""

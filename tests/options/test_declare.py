@@ -30,6 +30,8 @@ class Lamp:
     """Turn."""
     dimmed: Flag = False
     """Dim it."""
+    hours: Annotated[tuple[int, ...], AtLeast(0), option("H")] = ()
+    """When it is lit."""
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -43,6 +45,7 @@ class Lamp:
         ({"count": 0}, "--count 0: expected an integer of at least 1."),
         ({"colour": "blue"}, "--colour blue: expected one of warm, cold."),
         ({"turn_deg": float("inf")}, "--turn inf"),
+        ({"hours": (3, -1)}, "--hours 3 -1: expected a list of integers of at least 0."),
         ({"wats": 3}, "wats: no such option; did you mean watts?"),
     ],
 )

@@ -11,7 +11,7 @@ from evsplat.benching.drawn import Draw
 from evsplat.benching.given_pictures import PICTURES
 from evsplat.config import from_dict, load_yaml
 from evsplat.errors import ConfigError
-from evsplat.ranges import Above, AtLeast
+from evsplat.ranges import SEEDS, Above, AtLeast
 from evsplat.staging import StageSettings
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
@@ -94,7 +94,7 @@ class Suite:
     draw: Draw | None = None
     """Captures drawn at random in place of named ones."""
     title: str = ""
-    seeds: tuple[int, ...] = (0,)
+    seeds: Annotated[tuple[int, ...], SEEDS] = (0,)
     iterations: Annotated[int | None, AtLeast(1)] = None
     """Training steps of every row that names none itself; None: the method's own."""
     max_minutes: Annotated[float | None, Above(0)] = None

@@ -105,9 +105,10 @@ def check_options(options: Any) -> None:
         fits = not choices or value in choices
         if isinstance(value, float) and not math.isfinite(value):
             fits = False
-        if not fits or not all(value in allowed for allowed in ranges):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if not fits or not all(number in allowed for number in numbers for allowed in ranges):
             said = next((mark.name for mark in marks if getattr(mark, "name", None)), name)
-            shown = f"{value:g}" if isinstance(value, float) else value
+            shown = " ".join(f"{n:g}" if isinstance(n, float) else str(n) for n in numbers)
             wanted = expected(marked[name]).removesuffix(" or null")
             raise ConfigError(f"--{said.replace('_', '-')} {shown}: expected {wanted}.")
 

@@ -17,7 +17,7 @@ from evsplat.options.declare import (
     check_twins,
     option,
 )
-from evsplat.ranges import Above, AtLeast, AtMost, Within
+from evsplat.ranges import SEEDS, Above, AtLeast, AtMost, Within
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class TrainOptions:
     """Settings to change, such as event_weight=0.2; see docs/settings.md."""
     resume: Flag = False
     """Go on from the last checkpoint in --out."""
-    seed: Annotated[int | None, Within(-(2**63), 2**63 - 1), option("S", default="0")] = None
+    seed: Annotated[int | None, SEEDS, option("S", default="0")] = None
     """Seed of every random number."""
     use: Annotated[Use | None, option("{training,everything}", default="training")] = None
     """everything trains on all that was recorded and holds nothing out for test figures."""
@@ -243,7 +243,7 @@ class BenchOptions:
     """Training steps of every cell."""
     max_minutes: Annotated[float | None, Above(0), option("M", default="the suite's")] = None
     """Minutes of training of every cell; schedules are shortened to fit."""
-    seeds: Annotated[tuple[int, ...], option("[S ...]", default="the suite's")] = ()
+    seeds: Annotated[tuple[int, ...], SEEDS, option("[S ...]", default="the suite's")] = ()
     """Seeds of training in place of the suite's."""
     only: Annotated[tuple[str, ...], option("[ROW ...]", default="all rows")] = ()
     """Rows of the suite to run."""
