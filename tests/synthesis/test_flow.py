@@ -59,3 +59,14 @@ def test_light_that_fades_without_motion_fades():
     before, after = picture(image), picture(0.4 * image)
     between = next(FlowInterpolator().between(before, after, [0.5]))
     assert psnr(between, 0.7 * image) > 25
+
+
+@pytest.mark.parametrize(("height", "width"), [(11, 11), (11, 12), (12, 11)])
+def test_the_smallest_pictures_of_captures_are_moved_too(height, width):
+    image = texture(height, width, seed=6)
+    before, after = picture(image), picture(0.8 * image)
+    made = next(FlowInterpolator().between(before, after, [0.5]))
+    assert made.shape == image.shape
+    assert (made <= before.linear.max() + 1e-5).all() and (made >= 0).all()
+    standing = next(FlowInterpolator().between(before, before, [0.5]))
+    assert np.abs(standing - before.linear).max() < 1e-5

@@ -1,12 +1,16 @@
 """Super SloMo: the public checkpoint's keys and shapes, and what the networks' outputs mean."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
 
+from evsplat.capture import load_capture
 from evsplat.errors import WeightsError
-from evsplat.synthesis import super_slomo
+from evsplat.pictures.files import read_image, write_image
+from evsplat.synthesis import super_slomo, synthesize
 from evsplat.synthesis.interpolate import Picture
 from evsplat.synthesis.super_slomo import SuperSloMo, UNet, backward_warp
 from evsplat.weights import MissingWeights
@@ -149,6 +153,34 @@ def test_visibility_takes_all_of_one_picture(tmp_path):
         assert made[:-1, :-1] == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.parametrize("transfer", ["power", "srgb", "linear"])
+def test_a_standing_picture_stays_as_it_is_whatever_curve_its_camera_states(tmp_path, transfer):
+    """Sub-frames that are decoded by another curve than the pictures flicker between them."""
+    camera = {"width": 64, "height": 32, "K": [[50, 0, 32], [0, 50, 16], [0, 0, 1]]}
+    camera |= {"world_to_camera": np.eye(4).tolist(), "transfer": transfer}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    (tmp_path / "still").mkdir()
+    for index in range(5):
+        write_image(tmp_path / "still" / f"{index}.png", np.full((32, 64, 3), 60, np.uint8))
+    out = synthesize(
+        tmp_path / "still",
+        tmp_path / "out",
+        source_fps=100,
+        camera=tmp_path / "camera.json",
+        interpolation="super-slomo",
+        weights=checkpoint(tmp_path / "made_up.ckpt"),
+        upsample=3,
+        progress=False,
+    )
+    capture = load_capture(out)
+    for frame in capture.frames:
+        # the networks' warp makes the last row and column dark
+        assert (read_image(frame.image)[:-1, :-1] == 60).all()
+    assert capture.events is not None
+    seen = capture.events.between(*capture.events.time_range_us)
+    assert not ((seen.x < 63) & (seen.y < 31)).any()
+
+
 def test_missing_weights_say_what_and_where(tmp_path, monkeypatch):
     monkeypatch.delenv(super_slomo.CHECKPOINT.variable, raising=False)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
@@ -169,6 +201,9 @@ def test_other_files_are_no_checkpoint(tmp_path):
     # v2e's checkpoint of grey pictures has other inputs
     torch.save({"state_dictFC": zeros(2, 4), "state_dictAT": zeros(12, 5)}, path)
     with pytest.raises(WeightsError, match=r"conv1.weight: expected \(32, 6, 7, 7\)"):
+        SuperSloMo("power", path)
+    torch.save({"state_dictFC": {0: torch.zeros(2), "step": 3}, "state_dictAT": {}}, path)
+    with pytest.raises(WeightsError, match="state_dictFC.conv1.bias: expected"):
         SuperSloMo("power", path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(WeightsError, match="not a readable PyTorch weight file"):

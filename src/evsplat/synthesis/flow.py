@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from evsplat.errors import BackendError
 from evsplat.synthesis.interpolate import Picture
@@ -29,6 +29,8 @@ except ImportError as missing:
 _MATCH_SCALE = 0.04
 # What moves against the background lies before it: log weight per pixel of motion, and its limit.
 _FRONT_PER_PX, _FRONT_LIMIT = 1.0, 6.0
+# Pixels along the longer side of the smallest pictures that OpenCV's DIS takes.
+_SMALLEST_PX = 12
 # Of weights between exp(-25) and exp(6), this is what no pixel has arrived with.
 _NOTHING = 1e-12
 
@@ -57,13 +59,22 @@ class FlowInterpolator:
     ) -> Iterator[Float[np.ndarray, "H W C"]]:
         """Linear light at each fraction of the way from ``before`` to ``after``."""
         first, second = _grey_bytes(before.coded), _grey_bytes(after.coded)
-        there = _motion(before.coded, after.coded, self._dis.calc(first, second, None))
-        back = _motion(after.coded, before.coded, self._dis.calc(second, first, None))
+        there = _motion(before.coded, after.coded, self._flow(first, second))
+        back = _motion(after.coded, before.coded, self._flow(second, first))
         for fraction in fractions:
             yield _at(before.linear, after.linear, there, back, fraction)
 
+    def _flow(
+        self, first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]
+    ) -> Float[np.ndarray, "H W 2"]:
+        height, width = first.shape
+        missing = max(0, _SMALLEST_PX - max(height, width))
+        wide = (np.pad(grey, ((0, 0), (0, missing)), mode="edge") for grey in (first, second))
+        flow: np.ndarray = self._dis.calc(*wide, None)
+        return flow[:, :width]
 
-def _grey_bytes(coded: Float[np.ndarray, "H W C"]) -> np.ndarray:
+
+def _grey_bytes(coded: Float[np.ndarray, "H W C"]) -> UInt8[np.ndarray, "H W"]:
     return (coded.mean(axis=-1).clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 

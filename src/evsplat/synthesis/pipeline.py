@@ -70,8 +70,8 @@ def synthesize(
     settings = given(SynthesisSettings, settings, changes)
     source, out = Path(source), Path(out)
     opened = _open(source, source_fps, body, pose_source, camera)
-    interpolator = _interpolator(settings, weights)
     settings = _with_own_transfer(settings, opened)
+    interpolator = _interpolator(settings, weights)  # decodes by the camera's own curve
     plan = plan_exposures(opened.footage.times_us, settings)
     recorded = opened.events() if settings.events == "source" else None
     if settings.split == "source":
