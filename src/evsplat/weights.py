@@ -87,8 +87,16 @@ def state_under(path: Path, keys: tuple[str, ...]) -> dict[str, Tensor]:
         if isinstance(state.get(key), Mapping):
             state = state[key]
             break
-    tensors = {key: value for key, value in state.items() if isinstance(value, Tensor)}
-    return {key.removeprefix("module."): value for key, value in tensors.items()}
+    return {name.removeprefix("module."): value for name, value in named_tensors(state).items()}
+
+
+def named_tensors(state: Mapping[Any, Any]) -> dict[str, Tensor]:
+    """The tensors that have a name, which is all that a network takes of a checkpoint."""
+    return {
+        name: value
+        for name, value in state.items()
+        if isinstance(name, str) and isinstance(value, Tensor)
+    }
 
 
 def fill(

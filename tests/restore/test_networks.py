@@ -294,6 +294,31 @@ def test_what_is_missing_or_another_file_is_said_in_a_sentence(
     assert not Path(out).exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "document"),
+    [
+        *((name, {0: torch.zeros(2), "step": 3}) for name in CHECKPOINTS),
+        ("nafnet", {"params": {"intro.weight": torch.tensor(1.0)}}),
+        ("e2vid", {"config": ["model"], "state_dict": {}}),
+        ("e2vid", {"model": E2VID_MODEL, "state_dict": {0: torch.zeros(2), "step": 3}}),
+    ],
+)
+def test_a_file_without_named_tensors_is_told_in_a_sentence(
+    name, document, tiny_capture, tmp_path
+) -> None:
+    torch.save(document, tmp_path / "other.pth")
+    with pytest.raises(WeightsError, match=r"other\.pth: .*(this is not|expected) "):
+        RESTORERS[name](load_capture(tiny_capture()), weights=tmp_path / "other.pth")
+
+
+@pytest.mark.parametrize("key", ["num_bins", "num_encoders", "base_num_channels"])
+@pytest.mark.parametrize("value", ["five", None, -3, 0, 10**9, float("inf")])
+def test_a_size_that_no_e2vid_has_is_told_in_a_sentence(key, value, tiny_capture, tmp_path) -> None:
+    torch.save({"model": {**E2VID_MODEL, key: value}, "state_dict": {}}, tmp_path / "other.pth")
+    with pytest.raises(WeightsError, match=rf"model\.{key}: expected a whole number from 1 to"):
+        RESTORERS["e2vid"](load_capture(tiny_capture()), weights=tmp_path / "other.pth")
+
+
 class _Evil:
     def __reduce__(self):
         return (exec, ("raise SystemExit('ran')",))

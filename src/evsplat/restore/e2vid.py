@@ -21,10 +21,18 @@ from evsplat.events import EventStream
 from evsplat.events.maps import voxel_grid
 from evsplat.restore.intensity import FromEvents
 from evsplat.restore.network import enough_memory
-from evsplat.weights import WeightFile, fill, read_state
+from evsplat.weights import WeightFile, fill, named_tensors, read_state
 
 EVENTS_PER_PIXEL = 0.35
 """About how many events its authors give the network at a time."""
+
+_NUMBERS = {
+    "num_bins": (5, 64),
+    "num_encoders": (4, 5),
+    "base_num_channels": (32, 64),
+    "num_residual_blocks": (2, 16),
+}
+"""Usual values of what a checkpoint states, and the largest that are built."""
 
 State = tuple[Tensor, Tensor]
 
@@ -45,7 +53,8 @@ class E2Vid(FromEvents):
     def load(self, path: Path) -> "RecurrentUNet":
         """The network in the shape that the checkpoint states under 'model'."""
         state = read_state(path)
-        stated = state.get("model") or state.get("config", {}).get("model")
+        config = state.get("config")
+        stated = state.get("model") or (config.get("model") if isinstance(config, dict) else None)
         if not isinstance(stated, Mapping) or not isinstance(state.get("state_dict"), Mapping):
             raise WeightsError(
                 f"{path}: holds no 'model' and 'state_dict', expected {self.file.name}; fetch it "
@@ -59,15 +68,16 @@ class E2Vid(FromEvents):
                     f"{stated[key]!r}."
                 )
         network = RecurrentUNet(
-            bins=int(stated["num_bins"]),
-            levels=int(stated.get("num_encoders", 4)),
-            channels=int(stated.get("base_num_channels", 32)),
-            residuals=int(stated.get("num_residual_blocks", 2)),
+            bins=_number(stated, "num_bins", path),
+            levels=_number(stated, "num_encoders", path),
+            channels=_number(stated, "base_num_channels", path),
+            residuals=_number(stated, "num_residual_blocks", path),
             normalised=stated.get("norm") == "BN",
             interpolated=bool(stated.get("use_upsample_conv", True)),
         )
         tensors = {
-            key.removeprefix("unetrecurrent."): value for key, value in state["state_dict"].items()
+            name.removeprefix("unetrecurrent."): value
+            for name, value in named_tensors(state["state_dict"]).items()
         }
         fill(network, tensors, path, what=self.file.name, part="unetrecurrent.")
         return network
@@ -102,6 +112,22 @@ class E2Vid(FromEvents):
     def provenance(self) -> dict[str, Any]:
         """The weights and how events were grouped."""
         return {**super().provenance(), "events_per_pixel": EVENTS_PER_PIXEL}
+
+
+def _number(stated: Mapping[str, Any], key: str, path: Path) -> int:
+    """A number of layers or channels that a checkpoint states."""
+    usual, most = _NUMBERS[key]
+    found = stated.get(key, usual)
+    try:
+        number = int(found)
+    except (TypeError, ValueError, OverflowError):
+        number = 0
+    if not 1 <= number <= most:
+        raise WeightsError(
+            f"{path}: model.{key}: expected a whole number from 1 to {most}, found "
+            f"{str(found)[:60]!r}; this is not {E2Vid.file.name}."
+        )
+    return number
 
 
 class RecurrentUNet(nn.Module):

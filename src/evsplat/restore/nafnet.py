@@ -44,7 +44,7 @@ class NafNet(NetworkRestorer):
         """The network in the size that the checkpoint has."""
         state = state_under(path, ("params_ema", "params"))
         what = f"{self.file.name} or another checkpoint of NAFNet"
-        if "intro.weight" not in state:
+        if "intro.weight" not in state or not state["intro.weight"].ndim:
             raise WeightsError(f"{path}: holds no 'intro.weight'; this is not {what}.")
         width = len(state["intro.weight"])
         middle = _count(state, r"middle_blks\.(\d+)\.")

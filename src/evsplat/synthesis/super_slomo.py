@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from evsplat.errors import WeightsError
 from evsplat.pictures.light import Transfer, decode
 from evsplat.synthesis.interpolate import Picture
-from evsplat.weights import WeightFile, fill, read_state, sha256_of
+from evsplat.weights import WeightFile, fill, named_tensors, read_state, sha256_of
 
 CHECKPOINT = WeightFile(
     network="Super SloMo",
@@ -177,5 +177,5 @@ def _network(path: Path, state: dict[str, Any], key: str, inputs: int, outputs: 
         )
     what = f"{CHECKPOINT.name} of colour pictures"
     network = UNet(inputs, outputs)
-    fill(network, state[key], path, what=what, part=f"{key}.")
+    fill(network, named_tensors(state[key]), path, what=what, part=f"{key}.")
     return network
