@@ -14,6 +14,7 @@ from PIL import Image
 from evsplat.capture import Capture, Frame, Policy, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import deblur
+from evsplat.pictures.files import read_image, write_image
 from evsplat.restore import RESTORERS, restore_capture
 
 from ..seen import seen
@@ -106,6 +107,34 @@ def test_lens_distortion_is_gone_afterwards(tiny_capture: Factory, tmp_path: Pat
     for column in ("t", "x", "y", "p"):
         expected = getattr(old.events.between(*window), column)
         assert np.array_equal(getattr(new.events.between(*window), column), expected)
+
+
+@pytest.mark.parametrize("lens", [None, {"model": "opencv", "coefficients": [-0.1, 0, 0, 0]}])
+def test_dark_pictures_of_16_bits_keep_their_levels(
+    lens: dict | None, tiny_capture: Factory, tmp_path: Path
+) -> None:
+    """Light of a twentieth of the range has twelve levels in 8 bits."""
+    path = tiny_capture(width=64, height=48)
+    document = json.loads((path / "capture.json").read_text())
+    for camera in document["cameras"].values():
+        camera |= {"transfer": "linear", "distortion": lens}
+    files = {frame[key] for frame in document["frames"] for key in ("image", "sharp")}
+    for file in files | {view["image"] for view in document["novel_views"]}:
+        light = 0.05 * (read_image(path / file) / 255) ** 2.2
+        (path / file).unlink()
+        write_image(path / file, np.rint(light * 65535).astype(np.uint16))
+    (path / "capture.json").write_text(json.dumps(document))
+    old = load_capture(path)
+    new = load_capture(restore_capture(path, tmp_path / "sharp", transfer="linear"))
+    for frame in old.frames:
+        edges = frame.exposure_us, [frame.mid_us], old.contrast_threshold
+        seen_events = old.events.between(*frame.exposure_us)
+        (made,) = deblur(old.image(frame), seen_events, *edges, transfer="linear")
+        assert (made - new.image(frame.name)).abs().max() < 2e-5
+        assert (old.sharp(frame) - new.sharp(frame.name)).abs().max() < 2e-5
+        assert read_image(new.frame(frame.name).mask).dtype == np.uint8
+    for before, after in zip(old.novel_views, new.novel_views, strict=True):
+        assert (old.novel_image(before) - new.novel_image(after)).abs().max() < 2e-5
 
 
 def test_bad_input_leaves_nothing_behind(tiny_capture: Factory, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import copy_file, make_folder, new_folder, remove_file, write_json
-from evsplat.pictures.files import write_image
+from evsplat.pictures.files import read_image, write_image
 from evsplat.untrusted.text import read_json
 
 Frames = Sequence[Frame]
@@ -47,14 +47,18 @@ class Derivation:
         return self._entries[frame.name]
 
     def set_picture(self, frame: Frame, key: str, picture: Float[Tensor, "..."]) -> None:
-        """Write an ``image``, ``sharp`` or ``mask`` in [0, 1] of a frame, seen without lens."""
+        """Write an ``image``, ``sharp`` or ``mask`` in [0, 1] of a frame, seen without lens.
+
+        Pictures have as many bits as the frame's in the source, masks 8.
+        """
         entry = self.entry(frame)
         if key != "mask" and entry.pop("gain", None) is not None:
             # What is read is evened out, and so is what is made of it: the other one has to be too.
             for other in {"image", "sharp"} & entry.keys() - {key}:
                 self.set_as_read(frame, other)
         entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
-        write_picture(self.folder / entry[key], picture)
+        like = None if key == "mask" else self.source.frame(frame.name).image
+        write_picture(self.folder / entry[key], picture, like=like)
 
     def set_as_read(self, frame: Frame, key: str) -> None:
         """`set_picture` with what is read of the source's, which has no lens and no gain."""
@@ -134,12 +138,16 @@ def training_frames_first(
     yield from make(everything, [everything.frame(f.name) for f in seen.held_out_frames])
 
 
-def write_picture(path: Path, picture: Float[Tensor, "..."]) -> None:
-    """Write a picture in [0, 1] as 8-bit PNG."""
+def write_picture(path: Path, picture: Float[Tensor, "..."], *, like: Path | None = None) -> None:
+    """Write a picture in [0, 1] as PNG, of 8 bits or as many as the picture file ``like`` has."""
     make_folder(path.parent)
+    pixels = np.ascontiguousarray(picture.detach().cpu().numpy())
+    # 8 bits of light leave a dark picture a handful of levels.
+    if like is not None and (kind := read_image(like).dtype) == np.uint16:
+        pixels = (pixels.clip(0, 1) * np.iinfo(kind).max + 0.5).astype(kind)
     # It may be a hard link, and what it is linked to must stay.
     remove_file(path)
-    write_image(path, np.ascontiguousarray(picture.detach().cpu().numpy()))
+    write_image(path, pixels)
 
 
 def _stem(image: str) -> str:
@@ -175,7 +183,8 @@ def _undistort(making: Derivation) -> None:
         if view.camera in bent:
             remove_file(making.folder / entry["image"])
             entry["image"] = str(Path(entry["image"]).with_suffix(".png"))
-            write_picture(making.folder / entry["image"], source.novel_image(view))
+            place = making.folder / entry["image"]
+            write_picture(place, source.novel_image(view), like=view.image)
     if source.events is not None and source.frames[0].camera in bent:
         events = making.document["events"]
         write_events(making.folder / events["file"], _pieces(source))
