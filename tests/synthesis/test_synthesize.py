@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evsplat.capture import CaptureWriter, load_capture, validate_capture
+from evsplat.capture import CaptureWriter, Policy, load_capture, validate_capture
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import count_map
 from evsplat.inspection import inspect_capture
+from evsplat.masks import mask_capture
 from evsplat.pictures.files import read_image, write_image
 from evsplat.synthesis import SynthesisSettings, synthesize
 
@@ -344,6 +345,17 @@ def test_existing_capture_is_replaced_only_when_asked(tmp_path, posed):
     with pytest.raises(DataError, match="already exists"):
         synthesize(folder, tmp_path / "out", **options)
     synthesize(folder, tmp_path / "out", overwrite=True, **options)
+
+
+def test_masks_that_were_found_are_not_given_ones_afterwards(tiny_capture, tmp_path):
+    given = tiny_capture(width=64, height=48)
+    found = mask_capture(given, tmp_path / "found", method="silhouette")
+    for source, expected in ((given, "given"), (found, "estimated")):
+        out = synthesize(source, tmp_path / expected, subframes=3, events="none", **FAST)
+        made = load_capture(out)
+        assert all(frame.mask is not None for frame in made.frames)
+        assert made.for_training(Policy(masks="given")).terms().masks == expected
+        assert made.has_others_masks == (expected == "given")
 
 
 def test_recipes_are_the_papers():

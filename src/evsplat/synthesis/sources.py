@@ -170,6 +170,8 @@ class CaptureSource(Source):
         points = capture.initial_points()
         if points is not None:
             writer.set_points(*points)
+        if "masks" in capture.provenance:  # those that are found do not become given ones
+            writer.provenance["masks"] = capture.provenance["masks"]
 
 
 class _CaptureFootage:
