@@ -363,6 +363,14 @@ def test_a_bad_option_is_one_sentence(tmp_path: Path, fault: str) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tree"]
 
 
+@pytest.mark.parametrize("duty", [1.01, 2.5])
+def test_events_of_a_frame_do_not_reach_into_the_next(tmp_path: Path, duty: float) -> None:
+    kind, source, options = write("mmhpsd raw", tmp_path / "tree")
+    with pytest.raises(ConfigError, match=f"--event-duty {duty:g}: expected a share"):
+        import_capture(kind, source, tmp_path / "out", event_duty=duty, **options)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tree"]
+
+
 def test_many_actions_need_a_choice(tmp_path: Path) -> None:
     trees.write_mmhpsd_a(tmp_path / "tree")
     with pytest.raises(DataError, match="holds many actions; choose one with --action"):

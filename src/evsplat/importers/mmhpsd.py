@@ -12,7 +12,7 @@ from evsplat.body.pose_files import PoseSequence, read_poses
 from evsplat.body.pose_files.fields import axis_angles, numbers
 from evsplat.body.pose_files.sequence import make_sequence
 from evsplat.capture.write import CaptureWriter
-from evsplat.errors import DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStream, open_recording
 from evsplat.importers.base import (
     GUIDE,
@@ -63,6 +63,11 @@ class Mmhpsd(Importer):
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read one action; see `Importer.write`."""
         check_positive(shrink=self.shrink, fps=self.fps, event_duty=self.event_duty)
+        if self.event_duty > 1:
+            raise ConfigError(
+                f"--event-duty {self.event_duty:g}: expected a share of a frame's interval, at "
+                "most 1; events of a frame end before those of the next begin."
+            )
         layout = _find(source, self.action)
         pictures = numbered(layout.pictures, "grey pictures", PICTURES)
         poses = numbered(layout.poses, "poses", (".pkl", ".npz"))
