@@ -131,3 +131,14 @@ def test_an_old_gpu_and_an_old_gsplat_are_told(monkeypatch):
     assert cuda_support._gsplat().there
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "finds no usable GPU" in cuda_support._torch().detail
+
+
+def test_smpl_files_are_not_said_to_be_where_nothing_is(monkeypatch, tmp_path):
+    monkeypatch.setattr(doctor, "_version", lambda name: "0.26")
+    monkeypatch.setenv("EVSPLAT_BODY_MODELS", str(tmp_path))
+    assert doctor._body_models() == doctor.Check(
+        "SMPL bodies", "ok", f"body-models 0.26, files in {tmp_path}"
+    )
+    monkeypatch.setenv("EVSPLAT_BODY_MODELS", str(tmp_path / "gone"))
+    found = doctor._body_models()
+    assert found.status == "optional" and f"{tmp_path / 'gone'}, which is not there" in found.detail

@@ -311,6 +311,26 @@ def test_chart_of_any_range_is_finite(values, log):
     assert "nan" not in svg and "inf" not in svg and "<a>" not in svg
 
 
+@pytest.mark.parametrize("log", [False, True])
+@pytest.mark.parametrize("start", [1e-4, 30.0, 1234.5, 1e6, 1.7e9])
+@pytest.mark.parametrize("width", [1e-3, 0.03, 0.9])
+def test_no_two_ticks_of_a_chart_say_the_same(start, width, log):
+    """As those of 2 s of a recording whose clock began 20 minutes before."""
+    span = width * (start if log or start < 1 else 1)
+    ends = [start, start + span]
+    svg = line_chart([Series("a", ends, ends)], x_title="x", y_title="y", log=log)
+    ticks = re.findall(
+        r'<text class="tick" x="[^"]*" y="([^"]*)" text-anchor="(\w+)">([^<]*)<', svg
+    )
+    for anchor in ("middle", "end"):
+        labels = [said for _, where, said in ticks if where == anchor and said not in "xy"]
+        values = [1000 * float(said[:-1]) if said[-1] == "k" else float(said) for said in labels]
+        # Of decimal logarithms one may lie in the range; that of abscissae is always linear.
+        assert len(labels) > (1 if anchor == "middle" or not log else 0)
+        assert values == sorted(set(values))
+        assert all(start - span < value < start + 2 * span for value in values)
+
+
 def test_long_series_are_averaged():
     noisy = Series("noisy", range(100_000), [i % 2 for i in range(100_000)])
     scale = Series("scale", [0, 1], [0, 1])

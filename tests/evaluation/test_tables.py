@@ -1,7 +1,18 @@
 """Markdown and LaTeX tables."""
 
+import pytest
+
 from evsplat.evaluation.protocols import METRICS, REGIONS
-from evsplat.evaluation.tables import Heading, missing_networks, tables_of, write_tables
+from evsplat.evaluation.tables import (
+    Figure,
+    Heading,
+    Row,
+    Table,
+    latex,
+    missing_networks,
+    tables_of,
+    write_tables,
+)
 
 
 def row(psnr: float | None, ssim: float | None, lpips: float | None = None) -> dict:
@@ -66,6 +77,21 @@ def test_latex_is_escaped_and_every_row_has_all_cells(tmp_path):
     assert r"my\_method" in text
     body = text[text.index(r"\midrule") : text.index(r"\bottomrule")].splitlines()[1:]
     assert len(body) == 4 and {line.count("&") for line in body} == {9}
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        ("<b>|a", r"\textless{}b\textgreater{}\textbar{}a"),
+        ("[ours]", "{}[ours]"),
+        ("*", "{}*"),
+        ("ours*", "ours*"),
+    ],
+)
+def test_a_row_of_any_name_is_itself_in_latex(name, written):
+    rows = (Row("first", (Figure(1.0),)), Row(name, (Figure(2.0),)))
+    text = latex([Table("t", "n", (Heading("full", "PSNR", 2, True),), rows)])
+    assert f"{written} & " + r"\textbf{2.00} \\" in text.splitlines()
 
 
 def test_a_row_without_any_figure_has_its_reason_below(tmp_path):

@@ -106,3 +106,34 @@ def test_keys_turn_the_view_and_a_lost_drawing_is_told(run, tmp_path):
     assert said["focused"] and said["hidden"]
     np.testing.assert_allclose(said["after"], [heading + 0.1, pitch + 0.1, 0.9 * distance])
     assert "reload the page" in said["told"]
+
+
+@needs_browser
+def test_the_view_has_a_direction_from_straight_above_and_after_fingers_that_met(run, tmp_path):
+    page = export_run(run.path, "avatar", out=tmp_path / "dancer.html")
+    script = """
+      const { orbit } = avatarPlayer;
+      orbit.fingers.set(1, [5, 5]);
+      orbit.fingers.set(2, [5, 5]);
+      orbit.moved({ pointerId: 1, clientX: 50, clientY: 5, buttons: 1 }, 100);
+      const near = orbit.distance > 0;
+      const down = orbit.up.map((v) => -v);
+      orbit.stand([0, 0, 0], down, 2);
+      const forward = orbit.pose()[2].slice(0, 3);
+      const error = Math.hypot(...forward.map((v, k) => v - down[k]));
+      return JSON.stringify([near, error < 0.05, Math.abs(orbit.pitch) <= 1.55]);
+    """
+    assert json.loads(_said_by_browser(page, script, tmp_path)) == [True, True, True]
+
+
+@needs_browser
+def test_more_gaussians_than_the_device_can_draw_are_a_sentence(run, tmp_path):
+    page = export_run(run.path, "avatar", out=tmp_path / "dancer.html")
+    text = page.read_text(encoding="utf-8")
+    page.write_text(text.replace("gl.getParameter(gl.MAX_TEXTURE_SIZE)", "0"), encoding="utf-8")
+    script = """
+      const message = document.getElementById("message");
+      return message.hidden ? "" : message.textContent;
+    """
+    said = _said_by_browser(page, script, tmp_path)
+    assert said.startswith("These are more Gaussians than this device can draw")

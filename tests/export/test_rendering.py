@@ -1,5 +1,6 @@
 """Which instants are drawn, from where, and what arrives on disk."""
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -181,10 +182,22 @@ def test_out_chooses_video_or_pictures_and_parts_and_camera_are_obeyed(run, tmp_
         render_run(run, out=folder)
 
 
+@pytest.mark.parametrize("ending", ["mp4", "webp"])
+def test_a_film_too_wide_for_its_format_is_refused_before_it_is_drawn(run, tmp_path, ending):
+    keys = [{"at": 0, "eye": [0, 0, -3], "target": [0, 0, 0], "up": [0, -1, 0], "fov_y_deg": 40}]
+    path = {"format": "evsplat-camera-path", "version": 1, "width": 40, "height": 10, "keys": keys}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    given = {"path": str(tmp_path / "path.json"), "out": tmp_path / f"film.{ending}"}
+    with pytest.raises(ConfigError, match=r"17280 pixels wide, expected 1638. at most.*--size"):
+        render_run(run, size=4320, parts="human", **given)
+    assert [file.name for file in tmp_path.iterdir() if "film" in file.name] == []
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"fps": 0}, "--fps 0"),
+        ({"fps": 0.0004}, "--fps 0.0004: expected a number within 0.01 and 1000"),
         ({"slow": -1}, "--slow -1"),
         ({"slow": float("nan")}, "--slow nan"),
         ({"camera": "top"}, "only main, side"),

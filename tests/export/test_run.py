@@ -130,6 +130,7 @@ def test_up_turns_the_world_and_says_how(run, up, axis):
         ("avatar", {"canonical": True}, "--canonical: format avatar has no use"),
         ("ply", {"motion": "walk"}, "--motion: format ply has no use"),
         ("ply", {"canonical": True, "time_s": 0.1}, "at no time"),
+        ("ply", {"canonical": True, "low_pass": 0.3}, "--low-pass: .*--canonical"),
         ("avatar", {"parts": "scene"}, "no skeleton"),
         ("avatar", {"out": "a.ply"}, "ends in .html or is a folder"),
         ("avatar", {"motion": "swimming"}, "neither a file nor one of"),

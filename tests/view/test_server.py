@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -12,7 +13,7 @@ from evsplat.errors import ConfigError  # noqa: E402
 from evsplat.training.reconstruction import GaussianReconstruction  # noqa: E402
 from evsplat.training.run import Run  # noqa: E402
 from evsplat.view import viewed_run  # noqa: E402
-from evsplat.view.server import Viewer, _free_port  # noqa: E402
+from evsplat.view.server import Viewer, _address, _free_port  # noqa: E402
 
 from ..small_model import built, small_config  # noqa: E402
 
@@ -34,6 +35,15 @@ def test_a_port_in_use_gives_way_to_a_later_one():
 def test_an_address_that_cannot_be_had_is_named(host, port, named):
     with pytest.raises(ConfigError, match=named):
         _free_port(host, port)
+
+
+@pytest.mark.parametrize(
+    ("host", "named"),
+    [("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "localhost"), ("::", "localhost"), ("::1", "[::1]")],
+)
+def test_the_address_is_one_that_a_browser_can_open(host, named):
+    assert _address(host, 8080) == f"http://{named}:8080"
+    assert urlsplit(_address(host, 8080)).port == 8080
 
 
 def test_a_run_that_is_trained_on_later_is_followed(tiny_capture, tmp_path, monkeypatch):

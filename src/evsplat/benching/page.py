@@ -116,17 +116,23 @@ def _frame(
                 f"<figcaption><b>{escape(row.title)}</b></figcaption></figure>"
             )
             continue
-        figures = entry["protocols"]["standard"]
-        psnr = figures["person_crop"]["psnr"] or figures["full"]["psnr"]
         file = folder.run_of(row.run) / entry["pictures"]["render"]
         remedy = f"remove {folder.record_of(row.run)} to measure it again"
         picture = read_rgb(file, remedy)
-        note = "" if psnr is None else f"{psnr:.2f}\u00a0dB"
-        tiles.append(_tile(embed.image(picture, row.title), style, row.title, note))
+        tiles.append(_tile(embed.image(picture, row.title), style, row.title, _reached(entry)))
     return (
         f'<article class="frame"><h3>Frame {escape(frame.name)}</h3>'
         f'<div class="tiles">{"".join(tiles)}</div></article>'
     )
+
+
+def _reached(entry: Record) -> str:
+    """A frame's PSNR on the person crop; that of the full frame, where nobody is in it, says so."""
+    figures = entry["protocols"]["standard"]
+    for region, where in (("person_crop", ""), ("full", ", full frame")):
+        if (psnr := figures[region]["psnr"]) is not None:
+            return f"{psnr:.2f}\u00a0dB{where}"
+    return ""
 
 
 def _tile(image: str, style: str, title: str, note: str = "") -> str:

@@ -131,7 +131,13 @@ def _body_models() -> Check:
         remedy = "Get it with: pip install 'evsplat[body-models]' (and your own SMPL files)."
         return Check(name, "optional", "package body-models is not installed.", remedy)
     folder = os.environ.get("EVSPLAT_BODY_MODELS")
-    files = f"files in {folder}" if folder else "set EVSPLAT_BODY_MODELS to your SMPL files"
+    if not folder:
+        files = "set EVSPLAT_BODY_MODELS to your SMPL files"
+    elif os.path.exists(folder):
+        files = f"files in {folder}"
+    else:
+        detail = f"body-models {found}, but EVSPLAT_BODY_MODELS is {folder}, which is not there."
+        return Check(name, "optional", detail, "Set it to your SMPL files.")
     return Check(name, "ok", f"body-models {found}, {files}")
 
 

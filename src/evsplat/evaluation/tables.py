@@ -31,6 +31,8 @@ _LATEX = {
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     **{character: "\\" + character for character in "&%$#_{}"},
+    # In the encoding that LaTeX begins with these three are other characters.
+    **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"},
     **{"–": "--", "±": r"$\pm$", "†": r"$^\dagger$", "·": r"$\cdot$"},
     **{"↑": r"$\uparrow$", "↓": r"$\downarrow$"},
 }
@@ -313,7 +315,10 @@ def latex(tables: Sequence[Table]) -> str:
             r"\midrule",
         ]
         for row in table.rows:
-            cells = [_latex_text(row.title), *table.cells(row, forms, _latex_text)]
+            title = _latex_text(row.title)
+            if title.startswith(("[", "*")):
+                title = f"{{}}{title}"  # behind the end of a row these would be its arguments
+            cells = [title, *table.cells(row, forms, _latex_text)]
             lines.append(" & ".join(cells) + r" \\")
         lines += [r"\bottomrule", r"\end{tabular}", ""]
     return "\n".join(lines)

@@ -1,5 +1,6 @@
 """Drawing a trained run: test frames, or a film of the recording or of another motion."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +38,8 @@ FILM_HEIGHT = 720
 _NEAREST = 0.6
 """Depth that gets the lightest colour, as a share of the distance to the person."""
 _VIDEO, _ANIMATION = (".mp4",), (".gif", ".webp")
+_WIDEST_PX = {".mp4": 16_384, ".webp": 16_382, ".gif": 65_534}
+"""Even widths that x264, WebP and GIF can hold at most."""
 _OTHERS = (".avi", ".mov", ".mkv", ".webm", ".m4v", ".png", ".jpg", ".jpeg")
 """Endings of what is asked for as a file and not written."""
 _FULL_SCALE = 3.0
@@ -85,6 +88,7 @@ def render_run(
         height = max(camera.height for camera in loaded.capture.cameras.values())
         film = replace(film, size=max(FILM_HEIGHT, height))
     plan = FilmPlan.of(film, loaded.capture, loaded.reconstruction)
+    _check_width(film, plan, out)
     transfer = loaded.capture.transfer(loaded.capture.frames[0])
     look = Look(film.show, film.parts, film.transparent, transfer, plan.surroundings)
     trained = loaded.method, loaded.iteration, loaded.train_seconds
@@ -130,6 +134,25 @@ def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours:
             raise DataError(f"{out}: is a file; give a folder or a name in .mp4, .webp or .gif.")
         if not ours and out.is_dir() and any(out.iterdir()):
             raise DataError(f"{out}: the folder is not empty; give a new one to --out.")
+
+
+def _check_width(film: Film, plan: FilmPlan, out: Path) -> None:
+    """Refuse before hours of drawing a film that is wider than its format."""
+    most = _WIDEST_PX.get(out.suffix.lower())
+    drawn = plan.frames[0].camera
+    width = drawn.width
+    if film.beside:
+        if film.show == "events":
+            recorded = drawn
+        else:
+            first = recorded_by(plan.capture, film.camera)[0]
+            recorded = plan.capture.cameras[first.camera]
+        width += math.ceil(recorded.width * drawn.height / recorded.height)
+    if most is not None and width > most:
+        raise ConfigError(
+            f"--out {out}: the film would be {width} pixels wide, expected {most} at most; give a "
+            "smaller --size, or a folder."
+        )
 
 
 def _write(

@@ -100,7 +100,7 @@ class Film:
         float | None, Above(0), AtMost(86_400), option("S", default="all; 4 with --at")
     ] = None
     """Film so much of it."""
-    fps: Annotated[float, Above(0), AtMost(1000), option("HZ")] = 30.0
+    fps: Annotated[float, Within(0.01, 1000), option("HZ")] = 30.0
     """Pictures per second that the video plays."""
     slow: Annotated[float, Above(0), AtMost(10_000), option("FACTOR")] = 1.0
     """Times slower than life."""
@@ -217,6 +217,11 @@ class ExportOptions:
             raise ConfigError("--time and --frame both say when; give one of them.")
         if self.motion is None and self.motion_fps is not None:
             raise ConfigError("--motion-fps: goes with --motion; name one or leave it out.")
+        if self.canonical and self.low_pass is not None:
+            raise ConfigError(
+                "--low-pass: depends on how far the person is, which --canonical is from no "
+                "camera; leave one out."
+            )
         if self.canonical and (self.time_s is not None or self.frame is not None):
             raise ConfigError(
                 "--canonical is the person at rest, at no time; leave out --time, --frame."

@@ -60,7 +60,7 @@ class Viewer:
             self.server = _Server(host, self.port, label="evsplat", verbose=False)
         log_in_a_line(self.server.get_event_loop())
         self.port = self.server.get_port()
-        self.address = f"http://{'localhost' if host in _ALL_INTERFACES else host}:{self.port}"
+        self.address = _address(host, self.port)
         self._set_scene(up)
         self._clients: dict[int, Client] = {}
         self.server.on_client_connect(self._connected)
@@ -174,6 +174,14 @@ def _summary(viewed_runs: list[ViewedRun]) -> str:
             f"{scene:,} of the scene"
         )
     return "  \n".join(lines)
+
+
+def _address(host: str, port: int) -> str:
+    """Where a browser of this machine finds the page of a server that listens at ``host``."""
+    if host in _ALL_INTERFACES:
+        host = "localhost"
+    # The colons of an IPv6 address are no port's.
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def _free_port(host: str, port: int) -> int:

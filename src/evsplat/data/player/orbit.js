@@ -52,7 +52,8 @@ class Orbit {
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
     if (others.length) {
       const far = (place) => Math.hypot(place[0] - others[0][0], place[1] - others[0][1]);
-      this.distance *= far(before) / Math.max(far([event.clientX, event.clientY]), 1);
+      // Fingers that meet do not end at no distance, from which nothing leads back.
+      this.distance *= Math.max(far(before), 1) / Math.max(far([event.clientX, event.clientY]), 1);
     }
     if (others.length || event.buttons & 6) this.shift(dx / height, dy / height);
     else this.turn((-5 * dx) / height, (-5 * dy) / height);
@@ -72,8 +73,10 @@ class Orbit {
   stand(place, forward, distance) {
     this.distance = distance;
     this.target = V.plus(place, V.scaled(forward, distance));
-    this.pitch = Math.asin(Math.min(Math.max(V.dot(forward, this.up), -1), 1));
     this.heading = Math.atan2(V.dot(forward, this.north), V.dot(forward, this.east));
+    this.pitch = 0;
+    // Not straight up or down, where no direction is right.
+    this.turn(0, Math.asin(Math.min(Math.max(V.dot(forward, this.up), -1), 1)));
   }
 
   axes() {

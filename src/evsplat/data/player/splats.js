@@ -179,6 +179,7 @@ class SplatRenderer {
   // Gaussians with one of their skins: for the device, and what sorting them takes.
   pack(clouds, number) {
     const gl = this.gl, rows = Math.ceil((this.count * TEXELS) / WIDTH);
+    checkRows(gl, rows);
     const texels = new Float32Array(4 * WIDTH * rows);
     this.centers = new Float32Array(3 * this.count);
     const skin = { bones: new Uint16Array(4 * this.count), weights: new Float32Array(4 * this.count) };
@@ -207,6 +208,7 @@ class SplatRenderer {
     if (correctives && correctives.count > MOST_CORRECTIVES) throw new Error("Too many correctives.");
     this.corrected = correctives ? { count: correctives.count, gaussians } : { count: 0, gaussians: 0 };
     const rows = Math.max(1, Math.ceil((this.corrected.gaussians * MOST_CORRECTIVES) / CORRECTIVES_WIDTH));
+    checkRows(gl, rows);
     const texels = new Float32Array(4 * CORRECTIVES_WIDTH * rows);
     for (let k = 0; k < this.corrected.count; k++) {
       for (let row = 0; row < gaussians; row++) {
@@ -346,6 +348,12 @@ function program(gl, vertex, fragment) {
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
   return made;
+}
+
+// Rows that a texture cannot have would leave the picture black without a word.
+function checkRows(gl, rows) {
+  const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+  if (rows > most) throw new Error(`These are more Gaussians than this device can draw: ${rows} rows of a texture, at most ${most}.`);
 }
 
 function texture(gl) {

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 
 import numpy as np
 
@@ -154,7 +155,7 @@ def _ticks(low: float, high: float) -> list[tuple[float, str]]:
     step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough)
     first = math.ceil(low / step)
     last = math.floor(high / step)
-    return [(index * step, _label(index * step)) for index in range(first, last + 1)]
+    return [(index * step, _label(index * step, step)) for index in range(first, last + 1)]
 
 
 def _log_ticks(low: float, high: float) -> list[tuple[float, str]]:
@@ -165,12 +166,21 @@ def _log_ticks(low: float, high: float) -> list[tuple[float, str]]:
     values = [(e + math.log10(factor), factor * 10.0**e) for e in exponents for factor in factors]
     ticks = [(place, _label(value)) for place, value in values if low <= place <= high]
     # A range within a factor of two may hold none: fall back on linear places.
-    return ticks or [(place, _label(10**place)) for place, _ in _ticks(low, high)]
+    if ticks:
+        return ticks
+    places = [place for place, _ in _ticks(low, high)]
+    least = min((10**b - 10**a for a, b in pairwise(places)), default=1.0)
+    return [(place, _label(10**place, least)) for place in places]
 
 
-def _label(value: float) -> str:
+def _label(value: float, step: float = math.inf) -> str:
+    """A value in short, with as many digits as tell it from one that is a ``step`` away."""
+    digits = 1
+    if value and math.isfinite(step):
+        powers = (math.floor(math.log10(number)) for number in (abs(value), step))
+        digits = max(1, 1 + next(powers) - next(powers))
     if value and abs(value) < 1e-3:
-        return f"{value:.0e}".replace("e-0", "e-")
+        return f"{value:.{digits - 1}e}".replace("e-0", "e-")
     if abs(value) >= 1e4:
-        return f"{value / 1000:g}k"
-    return f"{value:.4g}"
+        return f"{value / 1000:.{max(digits, 6)}g}k"
+    return f"{value:.{max(digits, 4)}g}"
