@@ -137,6 +137,28 @@ def test_dark_pictures_of_16_bits_keep_their_levels(
         assert (old.novel_image(before) - new.novel_image(after)).abs().max() < 2e-5
 
 
+@pytest.mark.parametrize("lens", [None, {"model": "opencv", "coefficients": [-0.1, 0, 0, 0]}])
+def test_a_picture_that_several_entries_name_is_replaced_in_its_own_alone(
+    lens: dict | None, tiny_capture: Factory, tmp_path: Path
+) -> None:
+    """Of sharp video the frame's picture may be its own truth; another may be named alike."""
+    path = tiny_capture(width=64, height=48)
+    document = json.loads((path / "capture.json").read_text())
+    document["cameras"]["main"]["distortion"] = lens
+    for frame in document["frames"]:
+        frame["sharp"] = frame["image"]
+    document["frames"][1] |= {"image": "images/0000.bmp", "mask": None}
+    Image.open(path / "images/0001.png").save(path / "images/0000.bmp")
+    (path / "capture.json").write_text(json.dumps(document))
+    old, new = load_capture(path), load_capture(restore_capture(path, tmp_path / "out"))
+    for frame in old.frames:
+        assert (old.sharp(frame) - new.sharp(frame.name)).abs().max() < 0.003
+        assert (_edi(old, frame) - new.image(frame.name)).abs().max() < 0.003
+    named = {frame.image for frame in new.frames} | {frame.sharp for frame in new.frames}
+    assert len(named) == 2 * len(new.frames)
+    assert new.frames[1].mask is None and new.frames[2].mask is not None
+
+
 def test_bad_input_leaves_nothing_behind(tiny_capture: Factory, tmp_path: Path) -> None:
     path, out = tiny_capture(), tmp_path / "out" / "sharp"
     with pytest.raises(ConfigError, match="nothing.*edi"):

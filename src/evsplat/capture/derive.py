@@ -1,6 +1,8 @@
 """A capture made of another one: some pictures new, everything else as it was."""
 
 import dataclasses
+import functools
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,11 +56,39 @@ class Derivation:
         entry = self.entry(frame)
         if key != "mask" and entry.pop("gain", None) is not None:
             # What is read is evened out, and so is what is made of it: the other one has to be too.
-            for other in {"image", "sharp"} & entry.keys() - {key}:
-                self.set_as_read(frame, other)
-        entry[key] = f"{_FOLDERS[key]}/{self._stems[frame.name]}.png"
+            for other in {"image", "sharp"} - {key}:
+                if entry.get(other):
+                    self.set_as_read(frame, other)
+        self.drop(entry, key)
+        entry[key] = self.free(f"{_FOLDERS[key]}/{self._stems[frame.name]}")
         like = None if key == "mask" else self.source.frame(frame.name).image
         write_picture(self.folder / entry[key], picture, like=like)
+
+    def drop(self, entry: dict[str, Any], key: str) -> None:
+        """Take a picture out of a frame's or a view's entry; its file stays if others name it."""
+        uses = self._uses  # counted at first with this one
+        name = entry.pop(key, None)
+        if name is None:
+            return
+        uses[name] -= 1
+        if not uses[name]:
+            # It may be a hard link, and what it is linked to must stay.
+            remove_file(self.folder / name)
+
+    def free(self, stem: str) -> str:
+        """Name of a new picture that no entry has, such as that of a frame's own sharp one."""
+        name, number = f"{stem}.png", 1
+        while self._uses[name]:
+            number += 1
+            name = f"{stem}-{number}.png"
+        self._uses[name] += 1
+        return name
+
+    @functools.cached_property
+    def _uses(self) -> Counter[str]:
+        """How many entries name each picture file."""
+        entries = [*self.document["frames"], *self.document.get("novel_views", [])]
+        return Counter(entry[key] for entry in entries for key in _PICTURES if entry.get(key))
 
     def set_as_read(self, frame: Frame, key: str) -> None:
         """`set_picture` with what is read of the source's, which has no lens and no gain."""
@@ -85,8 +115,8 @@ class Derivation:
             entries = self.document.get(key, [])
             for entry in entries:
                 if entry[name] not in kept:
-                    for picture in set(_PICTURES) & set(entry):
-                        remove_file(self.folder / entry[picture])
+                    for picture in _PICTURES:
+                        self.drop(entry, picture)
             self.document[key] = [entry for entry in entries if entry[name] in kept]
         for frame in frames:
             # Without one it would follow from the place in the list.
@@ -175,14 +205,15 @@ def _undistort(making: Derivation) -> None:
         cameras[name]["distortion"] = None
     for frame in source.frames:
         entry = making.entry(frame)
-        for key in set(_PICTURES) & set(entry) if frame.camera in bent else ():
-            remove_file(making.folder / entry[key])
-            making.set_as_read(frame, key)
+        for key in _PICTURES if frame.camera in bent else ():
+            if entry.get(key):
+                making.set_as_read(frame, key)
     for view in source.novel_views:
         entry = making.document["novel_views"][view.index]
         if view.camera in bent:
-            remove_file(making.folder / entry["image"])
-            entry["image"] = str(Path(entry["image"]).with_suffix(".png"))
+            stem = Path(entry["image"]).with_suffix("").as_posix()
+            making.drop(entry, "image")
+            entry["image"] = making.free(stem)
             place = making.folder / entry["image"]
             write_picture(place, source.novel_image(view), like=view.image)
     if source.events is not None and source.frames[0].camera in bent:
