@@ -239,6 +239,15 @@ def test_unknown_format(tiny_capture: Factory) -> None:
 
 
 @pytest.mark.parametrize(
+    "keys", [("format",), ("version",), ("body", "model"), ("frames", 2, "split")]
+)
+def test_what_is_found_fits_a_message(tiny_capture: Factory, keys: tuple) -> None:
+    path = tiny_capture()
+    edit_json(path, *keys, value="x" * 100_000)
+    assert len(refuses_to_load(path)) < 1500
+
+
+@pytest.mark.parametrize(
     ("keys", "field", "nearest"),
     [
         (("frame",), "frame", "frames"),
@@ -643,6 +652,19 @@ def test_infinite_translation_names_the_pose(tiny_capture: Factory) -> None:
     )
 
 
+@pytest.mark.parametrize("times", [[math.nan] * 10, ["soon"] * 10, [[0]]])
+def test_a_pose_without_a_whole_time_is_named_by_its_place(tiny_capture: Factory, times) -> None:
+    path = tiny_capture(frames=10)
+
+    def spoil(poses: np.ndarray) -> np.ndarray:
+        poses[3, 1] = np.nan
+        return poses
+
+    edit_body(path, poses=spoil, times_us=np.array(times))
+    found = {finding.field: finding.found for finding in validate_capture(path)}
+    assert "in pose 3, joint 1" in found["poses[3, 1, 0]"] and "times_us" in found
+
+
 def test_pickled_objects_are_refused_and_not_run(tiny_capture: Factory) -> None:
     path = tiny_capture()
     edit_body(path, joint_names=np.array(["Hips", "Chest", None], dtype=object))
@@ -746,6 +768,17 @@ def test_links_in_the_event_file_that_lead_nowhere_are_no_data_sets(
         found = "what HDF5 cannot open" if kind == "to itself" else "nothing"
         assert finding.found.startswith(found) and finding.expected == "a data set"
     assert "events.h5" in refuses_to_load(path)
+
+
+@pytest.mark.parametrize("column", ["events/t", "events/x", "events/y", "events/p"])
+def test_columns_without_a_sign_are_to_be_converted_and_no_broken_file(
+    tiny_capture: Factory, column: str
+) -> None:
+    path = tiny_capture()
+    edit_events(path, column, lambda values: values.astype(np.uint64))
+    finding = the_only(path, "warning", deep=True)
+    check(finding, path / "events.h5", column, "uint64", "int")
+    load_capture(path)
 
 
 def test_index_must_reach_the_last_event_and_hold_beyond_it(tiny_capture: Factory) -> None:

@@ -144,7 +144,8 @@ class _Check:
             return ""
         times = self.arrays.get("times_us")
         words = f" in pose {index[0]}"
-        if times is not None and times.ndim == 1 and index[0] < len(times):
+        whole = times is not None and times.ndim == 1 and times.dtype.kind in "iu"
+        if times is not None and whole and index[0] < len(times):
             words += f" at {int(times[index[0]])} us"
         if key == "poses":
             names = self.arrays.get("joint_names")

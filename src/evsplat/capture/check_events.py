@@ -289,7 +289,8 @@ class _Scan:
         self.note("y", start, (y >= self.entry.height) | (y < 0), lambda i: f"{y[i]}")
         self.note("p", start, (p != 0) & (p != 1), lambda i: f"{p[i]}")
         if self.counts is not None and not self.count.keys() & {"x", "y"}:
-            place = y.astype(np.int64) * self.entry.width + x
+            # Of numbers without a sign the sum would be one with a point.
+            place = y.astype(np.int64) * self.entry.width + x.astype(np.int64)
             self.counts += np.bincount(place, minlength=self.counts.size).reshape(self.counts.shape)
         if "t" not in self.count:
             self.piece_of_index(start, t)

@@ -170,8 +170,8 @@ class StageSettings:
     """Leave out travel across the floor."""
     camera: Annotated[CameraMotion, option("HOW")] = "static"
     """Tripod (static), arc round the person (orbit) or handheld."""
-    orbit_deg: Annotated[float, Within(-360, 360), option("DEG", name="orbit")] = _ORBIT_DEG
-    """Arc of an orbiting camera in all."""
+    orbit_deg: Annotated[float, Within(-80, 80), option("DEG", name="orbit")] = _ORBIT_DEG
+    """Arc of an orbiting camera in all; a wider one would leave the room."""
     shadows: Annotated[Flag, option(name="shadow")] = True
     """Leave out the person's shadow on the room."""
     lamp_azimuth_deg: Annotated[

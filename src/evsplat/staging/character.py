@@ -97,10 +97,15 @@ def _check(path: Path, arrays: dict[str, np.ndarray]) -> None:
     for key, shape in (_ARRAYS | _OPTIONAL).items():
         if key not in arrays:
             continue
-        found = arrays[key].shape
+        found, kind = arrays[key].shape, arrays[key].dtype
+        what, kinds = ("texts", "US") if key == "joint_names" else ("numbers", "fiub")
+        if kind.kind not in kinds:
+            raise DataError(f"{path}: {key} is of type {kind}, expected {what}; correct the array.")
         wanted = tuple(sizes.get(side, side) if isinstance(side, str) else side for side in shape)
-        if len(found) != len(wanted) or any(
-            isinstance(side, int) and side != got for side, got in zip(wanted, found, strict=True)
+        if (
+            len(found) != len(wanted)
+            or 0 in found
+            or any(isinstance(w, int) and w != got for w, got in zip(wanted, found, strict=True))
         ):
             raise DataError(
                 f"{path}: {key} has shape {found}, expected ({', '.join(map(str, wanted))}); "
