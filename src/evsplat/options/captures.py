@@ -171,7 +171,7 @@ class StageSettings:
     camera: Annotated[CameraMotion, option("HOW")] = "static"
     """Tripod (static), arc round the person (orbit) or handheld."""
     orbit_deg: Annotated[float, Within(-80, 80), option("DEG", name="orbit")] = _ORBIT_DEG
-    """Arc of an orbiting camera in all; a wider one would leave the room."""
+    """Arc of an orbiting camera, up to 80."""
     shadows: Annotated[Flag, option(name="shadow")] = True
     """Leave out the person's shadow on the room."""
     lamp_azimuth_deg: Annotated[
