@@ -45,6 +45,7 @@ FOR_USERS = (
     "avatar3dgs_semantic",
     "hugs",
     "edi_avatar3dgs_semantic",
+    "paper_no_events",
     "paper",
     "evsplat",
     "evsplat_video",
