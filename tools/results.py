@@ -103,7 +103,7 @@ class _Line:
     """The row's name in the suite."""
     places: list[tuple[Records, str, str]]
     """For every compared capture: the records, the row and the capture that it is of."""
-    from_suite: bool
+    from_suite: bool = False
     """Whether it is of the suite's own lengths, which every row has."""
 
 
@@ -172,7 +172,7 @@ def _of_places(line: _Line, value: Callable[[Record], float | None]) -> list[flo
 
 def _line(of: Records, row: SuiteRow, captures: Sequence[str], said: str = "") -> _Line:
     places = [(of, row.name, capture) for capture in captures]
-    return _Line(title_of(of, row, captures) + said, row.name, places, from_suite=False)
+    return _Line(title_of(of, row, captures) + said, row.name, places)
 
 
 def _every_length(records: Records, longer: Records) -> Iterator[_Line]:

@@ -144,9 +144,8 @@ class _Check:
             return ""
         times = self.arrays.get("times_us")
         words = f" in pose {index[0]}"
-        whole = times is not None and times.ndim == 1 and times.dtype.kind in "iu"
-        if times is not None and whole and index[0] < len(times):
-            words += f" at {int(times[index[0]])} us"
+        if times is not None and times.ndim == 1 and times.dtype.kind in "iu":
+            words += f" at {int(times[index[0]])} us" if index[0] < len(times) else ""
         if key == "poses":
             names = self.arrays.get("joint_names")
             words += f", joint {index[1]}"

@@ -66,14 +66,13 @@ class Derivation:
 
     def drop(self, entry: dict[str, Any], key: str) -> None:
         """Take a picture out of a frame's or a view's entry; its file stays if others name it."""
-        uses = self._uses  # counted at first with this one
-        name = entry.pop(key, None)
-        if name is None:
-            return
-        uses[name] -= 1
-        if not uses[name]:
-            # It may be a hard link, and what it is linked to must stay.
-            remove_file(self.folder / name)
+        name = entry.get(key)
+        if name is not None:
+            self._uses[name] -= 1
+            if not self._uses[name]:
+                # It may be a hard link, and what it is linked to must stay.
+                remove_file(self.folder / name)
+        entry.pop(key, None)
 
     def free(self, stem: str) -> str:
         """Name of a new picture that no entry has, such as that of a frame's own sharp one."""

@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 from evsplat.errors import DataError
+from evsplat.untrusted.faults import shortened
 from evsplat.wording import begun
 
 _LONGEST = 400
+"""Letters of what is found in a file that fit a message."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +39,17 @@ class Findings:
 
     def error(self, file: Path, field: str, found: str, expected: str, remedy: str) -> None:
         """Add an error to the findings."""
-        self.items.append(Finding("error", file, field, shortened(found), expected, remedy))
+        found = shortened(found, _LONGEST)
+        self.items.append(Finding("error", file, field, found, expected, remedy))
 
     def warning(self, file: Path, field: str, found: str, expected: str, remedy: str) -> None:
         """Add a warning to the findings."""
-        self.items.append(Finding("warning", file, field, shortened(found), expected, remedy))
+        found = shortened(found, _LONGEST)
+        self.items.append(Finding("warning", file, field, found, expected, remedy))
 
     def error_count(self) -> int:
         """Count of the errors so far."""
         return sum(item.severity == "error" for item in self.items)
-
-
-def shortened(text: str) -> str:
-    """What is found in a file fits a message, however long the file has it."""
-    return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 
 def reason_and_remedy(error: DataError, file: Path) -> tuple[str, str]:

@@ -1,6 +1,5 @@
 """Drawing a trained run: test frames, or a film of the recording or of another motion."""
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -147,7 +146,7 @@ def _check_width(film: Film, plan: FilmPlan, out: Path) -> None:
         else:
             first = recorded_by(plan.capture, film.camera)[0]
             recorded = plan.capture.cameras[first.camera]
-        width += math.ceil(recorded.width * drawn.height / recorded.height)
+        width += _width_beside((recorded.width, recorded.height), drawn.height)
     if most is not None and width > most:
         raise ConfigError(
             f"--out {out}: the film would be {width} pixels wide, expected {most} at most; give a "
@@ -243,7 +242,13 @@ def _beside(
 
 def _side_by_side(left: Picture, right: Picture) -> Picture:
     """Join two pictures; the left one is scaled to the height of the right one."""
-    if left.shape[0] != right.shape[0]:
-        width = 2 * round(left.shape[1] * right.shape[0] / left.shape[0] / 2)
-        left = np.asarray(Image.fromarray(left).resize((width, right.shape[0])))
+    height = right.shape[0]
+    if left.shape[0] != height:
+        width = _width_beside((left.shape[1], left.shape[0]), height)
+        left = np.asarray(Image.fromarray(left).resize((width, height)))
     return np.concatenate([left, right], axis=1)
+
+
+def _width_beside(size: tuple[int, int], height: int) -> int:
+    """Width of a picture of (width, height) beside another, scaled to the height of that one."""
+    return size[0] if size[1] == height else 2 * round(size[0] * height / size[1] / 2)

@@ -115,4 +115,9 @@ def brief(value: Any) -> str:
         text = f"a {type(value).__name__} nested too deeply to be shown"
     except ValueError:
         text = "an integer of thousands of digits"
-    return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
+    return shortened(text, _LONGEST)
+
+
+def shortened(text: str, most: int) -> str:
+    """A text of ``most`` letters at most, which ends with "…" where it was cut."""
+    return text if len(text) <= most else text[: most - 1] + "…"
