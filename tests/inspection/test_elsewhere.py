@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from evsplat.capture import Policy, load_capture
 from evsplat.inspection import check_body, fit_sheet, inspect_capture, judge_body
 from evsplat.inspection.elsewhere import Elsewhere, find_elsewhere
+from evsplat.pictures.files import write_image
+from evsplat.pictures.light import Transfer, decode, encode
 
 FRAMES, HEIGHT, WIDTH = 16, 60, 90
 Film = tuple[np.ndarray, np.ndarray]
@@ -108,6 +111,25 @@ def test_warnings_say_where_it_is_and_what_comes_of_it(
     (said,) = caplog.messages
     assert "images: found something that moves or changes beside the person, at the upper" in said
     assert "the mean of what was seen" in said and "Crop" in said
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "linear"])
+def test_a_shadow_is_one_whether_values_are_coded_or_light(
+    path: Path, rng: np.random.Generator, transfer: Transfer
+) -> None:
+    """It comes and goes at the upper left, and takes half of the coded values, or less."""
+    for file in sorted((path / "images").iterdir()):
+        with Image.open(file) as image:
+            coded = np.asarray(image) / 255
+        coded[4:18, 4:20] = 0.7 * rng.choice([1, rng.uniform(0.5, 0.6)])
+        light = decode(torch.from_numpy(coded), "srgb")
+        values = np.round(65535 * encode(light, transfer).numpy()).astype(np.uint16)
+        write_image(file, values)
+    document = json.loads((path / "capture.json").read_text())
+    document["cameras"]["main"]["transfer"] = transfer
+    (path / "capture.json").write_text(json.dumps(document))
+    found = judge_body(load_capture(path).for_training(Policy()))
+    assert found.verdict == "belongs" and found.elsewhere is None
 
 
 def test_inspect_warns_and_draws_the_place(path: Path, tmp_path: Path) -> None:

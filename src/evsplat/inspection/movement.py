@@ -10,6 +10,7 @@ from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import DataError
 from evsplat.events import EventStore, EventStream, polarity_counts
 from evsplat.inspection.figure import Coarse
+from evsplat.pictures import shown
 from evsplat.spread import evenly_spread
 
 MOST_FRAMES = 32
@@ -68,10 +69,11 @@ def event_window(events: EventStore, frame: Frame) -> EventStream:
 def small_pictures(
     capture: TrainingCapture, frames: Sequence[Frame], coarse: Coarse
 ) -> Float32[np.ndarray, "K 3 h w"]:
-    """The frames' coded values in maps."""
+    """The frames' values in maps, coded also where the camera stores light as it stands."""
     small = []
     for frame in tqdm(frames, "pictures", unit="picture", leave=False, disable=None):
-        channels = capture.image(frame).unbind(-1)
+        # light as it stands makes other limits of what a shadow is
+        channels = shown(capture.image(frame), capture.transfer(frame)).unbind(-1)
         small.append(np.stack([coarse.shrunk(channel) for channel in channels]))
     return np.stack(small)
 
