@@ -99,6 +99,31 @@ def test_misplaced_body_is_told_by_pixels_and_direction(path: Path) -> None:
     assert f"the posed body is {found.place} what moves" in found.sentence
 
 
+@pytest.mark.parametrize("after_us", [1_000, 20_000])
+@pytest.mark.parametrize("frames", [2, -2])
+def test_delay_is_told_in_frames_of_the_camera_however_others_are_timed(
+    path: Path, frames: int, after_us: int
+) -> None:
+    document = json.loads((late(path, frames) / "capture.json").read_text())
+    document["cameras"]["other"] = document["cameras"]["main"]
+    others = [
+        {
+            "name": f"other_{frame['name']}",
+            "camera": "other",
+            "image": frame["image"],
+            "split": frame["split"],
+            "exposure_us": [time_us + after_us for time_us in frame["exposure_us"]],
+        }
+        for frame in document["frames"]
+    ]
+    changed_capture(
+        path, events=None, cameras=document["cameras"], frames=document["frames"] + others
+    )
+    found = judge_body(seen(path))
+    assert found.verdict == "off" and found.delay_frames == pytest.approx(frames, abs=0.5)
+    assert found.delay_us == 40_000 * found.delay_frames
+
+
 @pytest.mark.parametrize(("frames", "side"), [(2, "behind"), (-2, "ahead of")])
 def test_late_body_is_told_by_frames(path: Path, frames: int, side: str) -> None:
     found = judge_body(seen(late(path, frames)))

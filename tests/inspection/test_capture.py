@@ -75,6 +75,34 @@ def test_summary_tells_times_that_differ_from_frame_to_frame(
     assert ("exposure 30 ms (median; 30 to 60 ms)" in line) == (longest_us == 60_000)
 
 
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("cameras", [2, 3])
+def test_times_of_several_cameras_are_those_of_each(
+    tiny_capture: Factory, tmp_path: Path, cameras: int, together: bool
+) -> None:
+    """Their frames may come camera by camera, or all of a time together."""
+    path = tiny_capture(frames=12)
+    document = json.loads((path / "capture.json").read_text())
+    del document["events"]
+    (path / "events.h5").unlink()
+    main, own = document["cameras"]["main"], document["frames"]
+    for number in range(1, cameras):
+        name = f"other{number}"
+        document["cameras"][name] = main
+        # the last of the others stops earlier
+        for frame in own[: 12 - number]:
+            other = {"name": f"{name}_{frame['name']}", "camera": name, "split": frame["split"]}
+            other["image"], other["exposure_us"] = frame["image"], frame["exposure_us"]
+            document["frames"].append(other)
+    if together:
+        document["frames"].sort(key=lambda frame: frame["exposure_us"])
+    (path / "capture.json").write_text(json.dumps(document))
+    summary = inspect_capture(path, tmp_path / "out").summary
+    assert "time       0.470 s, 25 frames/s, exposure 30 ms" in summary
+    assert "32x24, standing cameras\n" in summary
+
+
 def test_events_without_polarity_are_told_from_a_scene_that_stands_still(
     tiny_capture: Factory, tmp_path: Path
 ) -> None:

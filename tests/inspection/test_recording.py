@@ -46,6 +46,19 @@ def test_counts_rate_size_and_polarity_are_right(tmp_path: Path, seed: int) -> N
             assert len(np.unique(np.asarray(image.convert("L")))) > 30
 
 
+@pytest.mark.parametrize("seconds", [0.002, 0.005, 0.01, 0.03])
+def test_the_highest_rate_is_no_less_than_the_mean(tmp_path: Path, seconds: float) -> None:
+    summary = inspect_recording(
+        _save(tmp_path / "events.npz", seconds=seconds), tmp_path / "out"
+    ).summary
+    said = re.search(r"s \((\S+?)([kM])/s, at most (\S+?)([kM])/s\)", summary)
+    assert said is not None
+    factor = {"k": 1e3, "M": 1e6}
+    mean, most = (float(said[at]) * factor[said[at + 1]] for at in (1, 3))
+    assert mean == pytest.approx(4_000 / seconds, rel=0.01)
+    assert mean <= most < (1.2 if seconds > 0.01 else 1.001) * mean
+
+
 def test_a_long_recording_is_summed_up_but_not_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -272,9 +272,11 @@ def _in_none(capture: TrainingCapture, figure: Figure, frames: Sequence[Frame]) 
 
 
 def _period_us(capture: TrainingCapture) -> float:
-    """Median time from a frame to the next, of all frames; of a single one its exposure."""
-    mids = np.unique([frame.mid_us for frame in capture.frames])
-    start, end = capture.frames[0].exposure_us
+    """Median time from a frame to the next, of all of the camera; of a single one its exposure."""
+    name = capture.train_frames[0].camera
+    frames = [frame for frame in capture.frames if frame.camera == name]
+    mids = np.unique([frame.mid_us for frame in frames])
+    start, end = frames[0].exposure_us
     return float(np.median(np.diff(mids))) if len(mids) > 1 else float(end - start)
 
 

@@ -119,7 +119,7 @@ class _Totals:
     end_us: int
     """One past the last event."""
     rate: Float[np.ndarray, "B"]
-    """Events per second, in bins of 10 ms from ``start_us``."""
+    """Events per second, in bins of 10 ms from ``start_us``, or one that is as long as all."""
     sample: EventStream
     """The first `MOST_EVENTS` events."""
 
@@ -145,7 +145,8 @@ class _Totals:
         if not count:
             raise DataError(f"{recording.path}: holds no events; is it the right file?")
         rows = np.concatenate(bins)
-        rate = np.bincount(rows[:, 0], rows[:, 1]) / (_RATE_BIN_US / 1e6)
+        # of a recording that is shorter than a bin the bin is no longer either
+        rate = np.bincount(rows[:, 0], rows[:, 1]) / (min(_RATE_BIN_US, end - start) / 1e6)
         noise, sample = meter.estimate(end - start), EventStream.joined(kept)
         dead = dead_lines_text(meter.total)
         return cls(width, height, noise, dead, count, brighter, start, end, rate, sample)

@@ -32,15 +32,15 @@ def summary_text(
         f"{name} {capture.cameras[name].width}x{capture.cameras[name].height}"
         for name in sorted({frame.camera for frame in frames})
     )
-    start, end = frames[0].exposure_us[0], frames[-1].exposure_us[1]
-    exposures_ms = np.array([b - a for a, b in (frame.exposure_us for frame in frames)]) / 1000
-    rate = f", {_rate_text(np.diff([frame.mid_us for frame in frames]))}" if frames[1:] else ""
+    starts_us, ends_us = np.transpose([frame.exposure_us for frame in frames])
+    exposures_ms, gaps_us = (ends_us - starts_us) / 1000, _gaps_us(frames)
+    rate = f", {_rate_text(gaps_us)}" if len(gaps_us) else ""
     lines = [
         f"{capture.name}   {capture.path}",
         f"frames     {len(frames)}: {len(capture.train_frames)} train, {len(capture.test_frames)} "
-        f"test; {cameras}, {'standing' if capture.is_static_camera else 'moving'} camera"
-        f"{_transfer_text(capture)}",
-        f"time       {(end - start) / 1e6:.3f} s{rate}, {_exposure_text(exposures_ms)}",
+        f"test; {cameras}, {_stand_text(frames)}{_transfer_text(capture)}",
+        f"time       {(ends_us.max() - starts_us.min()) / 1e6:.3f} s{rate}, "
+        f"{_exposure_text(exposures_ms)}",
         *_gain_lines(frames),
         f"events     {_events_text(capture)}",
         *_sensor_lines(capture, estimate, doubted),
@@ -75,6 +75,21 @@ def _gain_lines(frames: tuple[Frame, ...]) -> list[str]:
         f"gain       {min(gains):.2f} to {max(gains):.2f} of the brightest pictures' light, evened "
         "out on reading"
     ]
+
+
+def _stand_text(frames: tuple[Frame, ...]) -> str:
+    """Whether the cameras stand still."""
+    several = len({frame.camera for frame in frames}) > 1
+    still = all(frame.world_to_camera is None for frame in frames)
+    return f"{'standing' if still else 'moving'} camera{'s' if several else ''}"
+
+
+def _gaps_us(frames: tuple[Frame, ...]) -> np.ndarray:
+    """Times from a frame's middle to that of the next one of its camera."""
+    mids_us: dict[str, list[int]] = {}
+    for frame in frames:
+        mids_us.setdefault(frame.camera, []).append(frame.mid_us)
+    return np.concatenate([np.diff(one) for one in mids_us.values()])
 
 
 def _rate_text(gaps_us: np.ndarray) -> str:
