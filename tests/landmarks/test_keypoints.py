@@ -109,6 +109,20 @@ def test_points_at_zero_and_frames_with_nobody_are_not_seen(tmp_path):
     assert np.isfinite(found.places).all() and np.isfinite(found.sigma_px).all()
 
 
+@pytest.mark.parametrize("header", [False, True])
+@pytest.mark.parametrize("point", [0, 5, 16])
+def test_empty_cells_of_a_table_are_points_that_were_not_found(tmp_path, point, header):
+    values = points(17)
+    lines = write_csv(tmp_path / "a.csv", values).read_text().splitlines()[0 if header else 1 :]
+    first = lines[header].split(",")
+    first[3 * point : 3 * point + 3] = ["", "", ""]
+    lines[header] = ",".join(first)
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    found = read_keypoints(tmp_path / "a.csv", TIMES)
+    assert np.flatnonzero(found.seen[0] == 0).tolist() == [point] and (found.seen[1:] > 0).all()
+    np.testing.assert_allclose(found.places[1:], values[1:, :, :2])
+
+
 def test_cocos_visibility_is_no_confidence(tmp_path):
     values = points(17)
     values[..., 2] = 2

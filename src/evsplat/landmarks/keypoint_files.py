@@ -169,7 +169,8 @@ def _from_csv(path: Path) -> Float[np.ndarray, "N L D"]:
     try:
         with open_text(path, newline="") as stream:
             rows = [row for row in csv.reader(stream) if row]
-        first = 0 if rows and _is_number(rows[0][0]) else 1
+        # a cell is empty where a point was not found, also the first one of the first frame
+        first = 0 if rows and all(not cell or _is_number(cell) for cell in rows[0]) else 1
         array = np.array([[float(cell or "nan") for cell in row] for row in rows[first:]])
     except (ValueError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(
