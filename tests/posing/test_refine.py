@@ -215,6 +215,29 @@ def staged(body, size):
     return truth, Descent(correction, look, targets)
 
 
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_what_counts_about_somebody_turns_with_the_camera(body, rng, turns):
+    """Before a camera on its side, or as somebody who lies, they are as tall as they are."""
+    camera, track = front_camera(body, size=64), still_track(body)
+    image = torch.from_numpy(rng.uniform(0.1, 0.9, (len(TIMES), 64, 64, 3))).float()
+    ones, coloured = torch.ones(image.shape[:3]), torch.ones(len(TIMES), dtype=torch.bool)
+    upright = Targets(TIMES, [], coloured, image, image, ones, ones, camera, "power")
+    onto_side = torch.eye(4)
+    onto_side[:2, :2] = torch.tensor([[0.0, -1], [1, 0]])
+    pose = torch.linalg.matrix_power(onto_side, turns) @ camera.world_to_camera
+    turned = image.rot90(-turns, (1, 2))
+    on_side = Targets(
+        TIMES, [], coloured, turned, turned, ones, ones,
+        replace(camera, world_to_camera=pose), "power",
+    )  # fmt: skip
+    expected, found = upright.around(track), on_side.around(track)
+    counts = expected.weight.rot90(-turns, (1, 2))
+    assert 0.1 < float(counts.mean()) < 0.9
+    assert float((found.weight == counts).float().mean()) > 0.99
+    apart = (found.behind - expected.behind.rot90(-turns, (1, 2))).abs()
+    assert float((apart < 1e-3).float().mean()) > 0.95
+
+
 @pytest.mark.parametrize("carried", [False, True])
 def test_differences_are_those_of_whole_pictures(body, carried):
     """Only pixels with a weight are looked at; values and gradients as if all were."""

@@ -223,15 +223,19 @@ def _trust(picture: SharpPicture) -> Float[Tensor, "H W"]:
 def _distances(
     track: BodyTrack, times_us: Sequence[int], camera: Camera
 ) -> tuple[Float[Tensor, "P H W"], float]:
-    """Pixels to the posed body at each time, and its median height in pixels."""
-    found, heights = [], []
+    """Pixels to the posed body at each time, and how tall it is in the pictures, in pixels.
+
+    That is the median of its boxes' rows, or of their columns where they are more: of somebody who
+    lies, or before a camera on its side, rows are how thick they are.
+    """
+    found, sizes = [], []
     for time_us in times_us:
         inside = track_silhouette(track, time_us, camera).numpy()
-        rows = np.flatnonzero(inside.any(1))
-        heights.append(rows[-1] - rows[0] + 1 if len(rows) else 0)
+        sides = [np.flatnonzero(inside.any(axis)) for axis in (1, 0)]
+        sizes.append([side[-1] - side[0] + 1 if len(side) else 0 for side in sides])
         far = np.full(inside.shape, _FAR_PX)
-        found.append(distance_transform_edt(~inside) if len(rows) else far)
-    tall = float(np.median(heights))
+        found.append(distance_transform_edt(~inside) if len(sides[0]) else far)
+    tall = float(np.median(sizes, axis=0).max())
     if tall == 0:
         raise NobodyInViewError(
             "the posed body is in few of the pictures or in none, so that they tell nothing of "
