@@ -13,8 +13,10 @@ from PIL import Image
 from evsplat.body import BodyTrack
 from evsplat.capture import Policy, TrainingCapture, load_body_track, load_capture
 from evsplat.cli.main import main
+from evsplat.events import EventStream
 from evsplat.inspection import Belonging, check_body, fit_sheet, inspect_capture, judge_body
 
+from ..conftest import write_event_file
 from ..firewall.scrambled import Recorded, scrambled, write_recorded
 from ..small_model import small
 
@@ -46,6 +48,10 @@ def changed_capture(path: Path, **entries: object) -> Path:
     document = json.loads((path / "capture.json").read_text())
     (path / "capture.json").write_text(json.dumps(document | entries))
     return path
+
+
+def exposures(frames: list[dict]) -> list[tuple[int, int]]:
+    return [tuple(frame["exposure_us"]) for frame in frames]
 
 
 def stored(path: Path, name: str) -> np.ndarray:
@@ -87,6 +93,27 @@ def test_right_body_fits_where_it_is(path: Path, left_out: str) -> None:
     kinds = {"nothing": {"events", "frames"}, "events": {"frames"}, "pictures": {"events"}}
     assert set(found.shares) == kinds[left_out]
     assert all(share > 0.7 for share in found.shares.values()) and found.area < 0.25
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_handful_of_events_tells_of_no_other_place(
+    path: Path, rng: np.random.Generator, frames: int
+) -> None:
+    """As slow motion sends about a frame or two, which show no background either."""
+    document = json.loads((path / "capture.json").read_text())
+    kept = document["frames"][4 : 4 + frames]
+    changed_capture(path, frames=kept, novel_views=[])
+    events = load_capture(path).events
+    assert events is not None
+    for draw in range(5):
+        near = [events.between(start + 5_000, end - 5_000) for start, end in exposures(kept)]
+        stream = EventStream.joined(near)
+        some = stream.take(np.sort(rng.choice(len(stream), 25, replace=False)))
+        entry = document["events"] | {"file": f"few_{draw}.h5"}
+        write_event_file(path / entry["file"], some.t, some.x, some.y, some.p > 0)
+        changed_capture(path, events=entry)
+        found = judge_body(load_capture(path).for_training(Policy(use="everything")))
+        assert found.verdict == "unknown" and "too little moves" in found.sentence
 
 
 def test_misplaced_body_is_told_by_pixels_and_direction(path: Path) -> None:

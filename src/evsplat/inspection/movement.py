@@ -19,6 +19,9 @@ EVENT_REACH_US = 10_000
 CHANGED = 0.15
 """Difference to the background, in coded values, that counts in full."""
 _FEWEST_FOR_BACKGROUND = 3
+_FEWEST_EVENTS = 100
+"""Of all frames looked at: fewer lie where chance puts them, and fit somewhere else as well as
+where the person is."""
 
 
 def looked_at(capture: TrainingCapture) -> tuple[Frame, ...]:
@@ -48,14 +51,16 @@ def movement(
 
     "events": how many there are; "frames": difference to the median of the ``pictures``
     (`small_pictures`), 1 at most. What the capture lacks is left out, as are differences where the
-    camera moves, which has no ``pictures``, and what is the same everywhere.
+    camera moves, which has no ``pictures``, a handful of events, and what is the same everywhere.
     """
     found = {}
     if pictures is not None:
         found["frames"] = _differences(pictures)
     # events are of the first frame's camera
     if capture.events is not None and frames[0].camera == capture.frames[0].camera:
-        found["events"] = _event_counts(capture, frames, coarse)
+        counts = _event_counts(capture, frames, coarse)
+        if counts.sum() >= _FEWEST_EVENTS:
+            found["events"] = counts
     return {name: maps for name, maps in found.items() if np.ptp(maps, axis=(1, 2)).any()}
 
 
