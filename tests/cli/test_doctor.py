@@ -4,6 +4,7 @@ import importlib
 import json
 from importlib.metadata import PackageNotFoundError
 
+import pytest
 import torch
 
 from evsplat import cuda_support
@@ -21,6 +22,7 @@ EXPECTED = {
     "CUDA compiler",
     "video (PyAV)",
     "demo capture",
+    "viewer",
     "SMPL bodies",
     "optical flow",
     "Super SloMo",
@@ -142,3 +144,11 @@ def test_smpl_files_are_not_said_to_be_where_nothing_is(monkeypatch, tmp_path):
     monkeypatch.setenv("EVSPLAT_BODY_MODELS", str(tmp_path / "gone"))
     found = doctor._body_models()
     assert found.status == "optional" and f"{tmp_path / 'gone'}, which is not there" in found.detail
+
+
+@pytest.mark.parametrize("gone", [(), ("viser",), ("msgspec", "websockets")])
+def test_a_viewer_without_its_packages_is_told_with_those_that_are_absent(monkeypatch, gone):
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in gone else name)
+    (found,) = (check for check in doctor.run_checks() if check.name == "viewer")
+    assert (found.status, bool(found.remedy)) == (("optional", True) if gone else ("ok", False))
+    assert ", ".join(gone) in found.detail and "evsplat[view]" in found.remedy or not gone

@@ -67,6 +67,7 @@ def run_checks() -> Iterator[Check]:
         *(partial(_for_cuda, need) for need in needs()),
         _video,
         _demo,
+        _viewer,
         _body_models,
         _opencv,
         _super_slomo,
@@ -122,6 +123,14 @@ def _demo() -> Check:
         return Check("demo capture", "ok", str(demo_capture()))
     except DataError as error:
         return Check("demo capture", "missing", str(error))
+
+
+def _viewer() -> Check:
+    absent = [part for part in ("viser", "msgspec", "websockets") if find_spec(part) is None]
+    if absent:
+        detail = f"evsplat view, html clips: {', '.join(absent)} not installed."
+        return Check("viewer", "optional", detail, "Get it with: pip install 'evsplat[view]'.")
+    return Check("viewer", "ok", f"viser {_version('viser')}")
 
 
 def _body_models() -> Check:
