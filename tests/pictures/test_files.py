@@ -1,5 +1,6 @@
 """Pictures come out of files with all the bits that they were stored with."""
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,23 @@ def test_a_tiff_keeps_its_depth_however_it_is_packed(
     read = read_image(path)
     assert read.dtype == pixels.dtype
     assert np.array_equal(read.reshape(pixels.shape), pixels)
+
+
+def test_a_bitmap_with_16_bits_of_all_colours_reaches_black_and_white(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
+    levels = rng.integers(0, (32, 64, 32), (6, 8, 3))
+    levels[0, :2] = 0, 0, 0
+    levels[1, :2] = 31, 63, 31
+    words = (levels @ (1 << 11, 1 << 5, 1)).astype("<u2")[::-1].tobytes()
+    masks = struct.pack("<3I", 0xF800, 0x07E0, 0x001F)
+    header = struct.pack("<IiiHHIIiiII", 40, 8, 6, 1, 16, 3, len(words), 0, 0, 0, 0) + masks
+    start = 14 + len(header)
+    head = struct.pack("<2sIHHI", b"BM", start + len(words), 0, 0, start)
+    (tmp_path / "p.bmp").write_bytes(head + header + words)
+    read = read_image(tmp_path / "p.bmp")
+    assert read.dtype == np.uint8
+    assert np.abs(read - levels * 255 / (31, 63, 31)).max() <= 1
 
 
 @pytest.mark.parametrize("kind", ["f4", "i4"])

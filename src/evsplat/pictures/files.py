@@ -148,6 +148,8 @@ def _pixels(path: Path, image: Image.Image) -> np.ndarray | None:
 
 
 def _has_16_bits(image: Image.Image) -> bool:
+    if image.format == "BMP":  # whose 16 bits are those of all three colours
+        return False
     if isinstance(image, TiffImageFile):  # a packed one's tiles do not say it
         return max(image.tag_v2.get(BITSPERSAMPLE, (8,))) > 8
     return any(

@@ -42,6 +42,21 @@ def test_key_sets_and_polarities_give_the_same_events(tmp_path: Path, name: str,
     assert same(EventStream(read.t - shift, read.x, read.y, read.p), stream)
 
 
+@pytest.mark.parametrize("kind", ["i8", "f8"])
+def test_nanoseconds_are_rounded_in_tables_as_in_texts(
+    rng: np.random.Generator, tmp_path: Path, kind: str
+) -> None:
+    s = random_stream(6, 400)
+    t_ns = np.sort(rng.integers(-(10**6), 10**6, 400)) | 1  # no half of a microsecond
+    np.savez(tmp_path / "e.npz", t=t_ns.astype(kind), x=s.x, y=s.y, p=s.p)
+    rows = zip(t_ns, s.x, s.y, s.p, strict=True)
+    lines = ["t,x,y,p", *(",".join(map(str, row)) for row in rows)]
+    (tmp_path / "e.csv").write_text("\n".join(lines) + "\n")
+    array, text = (read_events(tmp_path / name, time_unit="ns") for name in ("e.npz", "e.csv"))
+    assert np.array_equal(array.t, np.rint(t_ns / 1000))
+    assert same(array, text)
+
+
 def test_structured_and_plain_npy(tmp_path: Path) -> None:
     s = random_stream(4, 500)
     fields = [("timestamp", "i8"), ("x", "u2"), ("y", "u2"), ("polarity", "?")]

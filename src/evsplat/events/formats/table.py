@@ -170,7 +170,9 @@ def to_microseconds(t: np.ndarray, unit: str, where: str, first: int = 0) -> np.
     if t.dtype.kind == "f":
         return np.rint(t * _PER_US[unit]).astype(np.int64)
     t = t.astype(np.int64, copy=False)
-    return t // 1000 if unit == "ns" else t if unit == "us" else t * int(_PER_US[unit])
+    if unit == "ns":  # halves away from zero, as texts are rounded
+        return np.sign(t) * ((np.abs(t) + 500) // 1000)
+    return t if unit == "us" else t * int(_PER_US[unit])
 
 
 def to_whole(values: np.ndarray, name: str, where: str, first: int = 0) -> np.ndarray:
