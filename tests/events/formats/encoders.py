@@ -118,17 +118,19 @@ def aedat3(
     packet: int = 700,
     invalid_every: int = 0,
     sensor: str = "SENSOR",
+    source: int = 1,
 ) -> bytes:
     """Packets of AEDAT 3.1; a new one where the 31 bits of the clock are over. One of IMU between.
 
     Without frames a black one says the size of the sensor.
     """
-    out = f"#!AER-DAT3.1\r\n#Format: RAW\r\n#Source 1: {sensor}\r\n#!END-HEADER\r\n".encode()
+    lines = "#!AER-DAT3.1", "#Format: RAW", f"#Source {source}: {sensor}", "#!END-HEADER"
+    out = "".join(f"{line}\r\n" for line in lines).encode()
 
     def add(kind: int, size: int, overflow: int, data: bytes) -> None:
         nonlocal out
         count = len(data) // size
-        out += struct.pack("<hhiiiiii", kind, 1, size, 4, overflow, count, count, count) + data
+        out += struct.pack("<hhiiiiii", kind, source, size, 4, overflow, count, count, count) + data
 
     pending, epoch = b"", 0
     for index, (t, x, y, on) in enumerate(rows(s)):

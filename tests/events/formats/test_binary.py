@@ -173,6 +173,35 @@ def test_what_of_aedat3_is_not_read_is_one_sentence(
         list(open_recording(path).frames())
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_two_cameras_in_aedat3_one_gives_size_events_and_frames(
+    tmp_path: Path, seed: int
+) -> None:
+    s = random_stream(seed, 900)
+    s = EventStream(s.t, s.x % 240, s.y % 180, s.p)
+    other = random_stream(seed + 10, 500)
+    other = EventStream(other.t, other.x % 128, other.y % 128, other.p)
+    none = other.take(slice(0))
+    dark, light = (np.full((180, 240), level, np.uint8) for level in (9, 200))
+    cameras = [
+        encoders.aedat3(events, 240, 180, [(picture, 40, 80)], sensor=name, source=number)
+        for number, name, picture, events in (
+            (0, "DVS128", dark, none),
+            (1, "DAVIS240C", light, s),
+            (0, "DVS128", dark, other),
+        )
+    ]
+    end = b"#!END-HEADER\r\n"
+    header = cameras[0].split(end)[0] + b"#Source 1: DAVIS240C\r\n" + end
+    path = tmp_path / "two.aedat"
+    path.write_bytes(header + b"".join(camera.split(end, 1)[1] for camera in cameras))
+    recording = open_recording(path)
+    assert (recording.width, recording.height) == (240, 180)
+    assert same(recording.read(), s)
+    assert [int(frame.image[0, 0]) for frame in recording.frames()] == [200]
+    assert any("only events of source 1 are read" in note for note in recording.notes)
+
+
 def test_two_recordings_of_aedat3_in_one_file_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "e.aedat"
     data = encoders.aedat3(random_stream(3, 20), WIDTH, HEIGHT)

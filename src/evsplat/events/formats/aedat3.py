@@ -50,7 +50,10 @@ _CHANNELS = (1, 3, 4)
 
 
 class Aedat3(Source):
-    """An AEDAT 3.1 file; of events and of frames those of the first source that has them."""
+    """An AEDAT 3.1 file; the events of the first source that has any, and its frames.
+
+    Where that one has no frames they are those of the first source that has.
+    """
 
     def read_header(self, options: ReadOptions) -> None:
         """See `Source`."""
@@ -61,7 +64,9 @@ class Aedat3(Source):
                 f"{self.path}: its packets are packed ({packing}), expected '#Format: RAW'; "
                 "write it as AEDAT4 with DV, or record without compression."
             )
-        name = (_value(lines, r"Source \d+") or "").lower()
+        first_events = next(self._packets(_POLARITY, Damage(self.path, repair=True)), None)
+        self._source = None if first_events is None else int(first_events[1]["source"])
+        name = self._sensor(lines)
         self.width, self.height = next(
             (size for chip, size in _SIZES.items() if name.startswith(chip)), (None, None)
         )
@@ -96,7 +101,9 @@ class Aedat3(Source):
         return self._frames(self.damage)
 
     def _frames(self, damage: Damage) -> Iterator[RecordedFrame]:
-        for offset, head, body in self._packets(_FRAME, damage):
+        own = next(self._packets(_FRAME, Damage(self.path, repair=True), self._source), None)
+        source = None if own is None else self._source
+        for offset, head, body in self._packets(_FRAME, damage, source):
             if head["size"] < _FRAME_HEAD.itemsize:
                 _broken(damage, offset, f"its frames have {head['size']} bytes")
                 continue
@@ -150,9 +157,20 @@ class Aedat3(Source):
             f"{self.path}: its AEDAT 3.1 header has no line {_END.decode()}; copy it again."
         )
 
-    def _packets(self, kind: int, damage: Damage) -> Iterator[tuple[int, np.void, bytes]]:
-        """Offset, header and events of each packet of a kind."""
-        source = None
+    def _sensor(self, lines: list[str]) -> str:
+        """Name of the sensor whose events are read, in small letters; empty where none is named."""
+        found = (re.fullmatch(r"#\s*Source (\d+): *(.*)", line) for line in lines)
+        names = {int(match[1]): match[2].strip() for match in found if match}
+        if len(names) > 1 and self._source is not None:
+            listed = ", ".join(f"{number} ({name})" for number, name in names.items())
+            self.notes.append(f"sources {listed}: only events of source {self._source} are read")
+        first = next(iter(names.values()), "")
+        return (first if self._source is None else names.get(self._source, first)).lower()
+
+    def _packets(
+        self, kind: int, damage: Damage, source: int | None = None
+    ) -> Iterator[tuple[int, np.void, bytes]]:
+        """Offset, header and events of each packet of a kind, of the first source if not given."""
         with ByteReader(self.path, self._start) as reader:
             while True:
                 offset = reader.offset
