@@ -11,6 +11,7 @@ from evsplat.cli import main
 from evsplat.errors import ConfigError, DataError
 from evsplat.events import EventStore, EventStream, open_recording, read_events, write_events
 from evsplat.events.convert import convert_recording
+from evsplat.events.store import ALWAYS
 
 from .formats.helpers import HEIGHT, WIDTH, random_stream, same
 
@@ -36,6 +37,23 @@ def test_what_is_written_in_pieces_is_read_back(tmp_path: Path, suffix: str, fir
         assert (recording.width, recording.height) == (WIDTH, HEIGHT)
         assert recording.notes == []
         assert same(recording.read(), s)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_streams_that_are_darker_throughout_keep_their_polarity(
+    rng: np.random.Generator, tmp_path: Path, suffix: str
+) -> None:
+    s = random_stream(int(rng.integers(1 << 30)), 500)
+    s = EventStream(s.t, s.x, s.y, np.full_like(s.p, -1))
+    first, last = tmp_path / f"e{suffix}", tmp_path / "events.h5"
+    write_events(first, s, width=WIDTH, height=HEIGHT)
+    assert same(read_events(first), s)
+    convert_recording(first, last)
+    store = EventStore(last, WIDTH, HEIGHT)
+    assert store.has_polarity
+    middle_us = int(s.t[250])
+    assert not store.restricted_to([(ALWAYS[0], middle_us)]).has_polarity
+    assert same(store.between(*store.time_range_us), s)
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".npz", ".csv"])

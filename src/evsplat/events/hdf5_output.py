@@ -4,7 +4,22 @@ import io
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
+
 from evsplat.files import open_output
+
+_ONLY_DARKER = "only_darker"
+"""Attribute of a recording in which every event is darker, as its polarities look like none."""
+
+
+def note_only_darker(file: h5py.File) -> None:
+    """Write down that the recording has polarities, all of which are 0."""
+    file.attrs[_ONLY_DARKER] = True
+
+
+def has_only_darker(file: h5py.File) -> bool:
+    """Whether polarities that are 0 throughout mean darker; else there are none."""
+    return bool(file.attrs.get(_ONLY_DARKER, False))
 
 
 class Hdf5Output(io.RawIOBase):

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from evsplat.errors import DataError, HeldOutError
+from evsplat.events.hdf5_output import has_only_darker
 from evsplat.events.stream import EventStream
 from evsplat.untrusted.faults import broken_as
 from evsplat.untrusted.hdf5 import data_set, open_hdf5
@@ -132,15 +133,21 @@ class EventStore:
 
     @property
     def has_polarity(self) -> bool:
-        """False where every stored polarity is 0: the sensor did not say, and slices have p = 0."""
+        """False where every stored polarity is 0: the sensor did not say, and slices have p = 0.
+
+        Unless the file says that all of them are darker, as `write_events` has it; where some are
+        held out that is not asked, as it depends on them.
+        """
         if self._has_polarity is None:
             blocks = [
                 (start, min(start + _POLARITY_BLOCK, last))
                 for first, last in self._readable_rows
                 for start in range(first, last, _POLARITY_BLOCK)
             ]
-            self._has_polarity = not blocks or any(
-                bool(self._read("events/p", *block).any()) for block in blocks
+            self._has_polarity = (
+                not blocks
+                or self._has_only_darker()
+                or any(bool(self._read("events/p", *block).any()) for block in blocks)
             )
         return self._has_polarity
 
@@ -378,6 +385,14 @@ class EventStore:
     def _read(self, key: str, first: int, last: int) -> np.ndarray:
         with broken_as(self.path, f"{key}[{first}:{last}] cannot be read", "copy the file again"):
             return self._open()[key][first:last]
+
+    def _has_only_darker(self) -> bool:
+        if self._readable_us != (ALWAYS,):
+            return False
+        self._open()
+        assert self._file is not None
+        with broken_as(self.path, "its attributes cannot be read", "copy the file again"):
+            return has_only_darker(self._file)
 
     def _check(self, x: np.ndarray, y: np.ndarray, p: np.ndarray, first: int) -> None:
         neither = (p != 0) & (p != 1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from evsplat.disk import uninterrupted
 from evsplat.errors import ConfigError, DataError
-from evsplat.events.hdf5_output import Hdf5Output
+from evsplat.events.hdf5_output import Hdf5Output, note_only_darker
 from evsplat.events.stream import EventStream
 from evsplat.files import atomic_path, open_output, try_target, unnamed_file
 
@@ -137,6 +137,7 @@ class Hdf5Writer(Writer):
         self._file = h5py.File(self._output, "w")
         self.callback(self._close)
         self._count = self._offset = self._next_ms = 0
+        self._only_darker = True
         self._index: list[np.ndarray] = []
         packing: dict[str, Any] = {
             "chunks": (CHUNK_EVENTS,),
@@ -164,6 +165,7 @@ class Hdf5Writer(Writer):
             column = self._file[f"events/{name}"]
             column.resize((end,))
             column[self._count :] = values
+        self._only_darker &= bool((piece.p < 0).all())
         edges = np.arange(self._next_ms, int(t[-1]) // 1000 + 1, dtype=np.int64)
         self._index.append(np.searchsorted(t, edges * 1000, side="left") + self._count)
         self._next_ms += len(edges)
@@ -176,6 +178,8 @@ class Hdf5Writer(Writer):
         with uninterrupted():
             self._file["ms_to_idx"] = np.concatenate([*self._index, tail]).astype(np.uint64)
             self._file["t_offset"] = np.int64(self._offset)
+            if self._count and self._only_darker:
+                note_only_darker(self._file)
         self._close()
         self._output.raise_error()
 

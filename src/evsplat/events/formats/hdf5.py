@@ -19,6 +19,7 @@ from evsplat.events.formats.base import (
     Source,
 )
 from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
+from evsplat.events.hdf5_output import has_only_darker
 from evsplat.options import ReadOptions
 from evsplat.untrusted.faults import broken_as
 from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5, wrong_data_set
@@ -84,9 +85,11 @@ class Hdf5(Source):
         return {key: column.read(file, part) for key, column in self._columns.items()}
 
     def _any_polarity(self, file: h5py.File) -> bool:
-        """True where an event after the first slice has a polarity other than 0."""
+        """True where an event after the first slice has a polarity other than 0, or 0 is one."""
         if "p" not in self._columns:
             return False
+        if has_only_darker(file):
+            return True
         starts = range(BLOCK_EVENTS, self._count, BLOCK_EVENTS)
         slices = (slice(first, first + BLOCK_EVENTS) for first in starts)
         return any(self._columns["p"].read(file, part).any() for part in slices)

@@ -65,7 +65,9 @@ class Text(Source):
                 )
         self._roles = [_COMPONENTS.find(name) if name else -1 for name in columns]
         self._unit = options.time_unit or self._find_unit(columns.index("t"))
-        self.has_polarity = "p" in columns and self._any_polarity()
+        # as `CsvWriter` has it: in a column called "on" 0 is darker
+        called_on = ("on", "p") in zip(file.names, columns, strict=False)
+        self.has_polarity = "p" in columns and (called_on or self._any_polarity())
         if not self.has_polarity and len(file.sample):
             self.notes.append(NO_POLARITY)
 
