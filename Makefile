@@ -1,16 +1,18 @@
 # `make demo`, `make view` and `make test` set up a virtual environment on the first call and reuse
 # it afterwards; each installs only what it needs on top of what is there. `make view` shows RUN, by
 # default what `make demo` trained last.
-# Options: PYTHON=python3.12 (which interpreter), VENV=.venv (where the environment lies).
+# Options: PYTHON=python3.12 (which interpreter), VENV=.venv (where the environment lies),
+# CONSTRAINTS=constraints-lowest.txt (which versions: the oldest ones that do).
 
 VENV ?= .venv
+CONSTRAINTS ?= constraints.txt
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 VIEW_STAMP := $(VENV)/.installed-view
 DEV_STAMP := $(VENV)/.installed-dev
-INSTALL := $(BIN)/python -m pip install --constraint constraints.txt
+INSTALL := $(BIN)/python -m pip install --constraint $(CONSTRAINTS)
 RUN ?= $(lastword $(sort $(wildcard runs/demo_*/*/*)))
-SET_UP_INPUTS := pyproject.toml constraints.txt CMakeLists.txt \
+SET_UP_INPUTS := pyproject.toml $(CONSTRAINTS) CMakeLists.txt \
 	$(shell find native -type f 2>/dev/null | LC_ALL=C sort)
 
 # Byte code is made of what is imported, as it is imported: of all of PyTorch, three quarters of an

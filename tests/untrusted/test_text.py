@@ -23,8 +23,8 @@ def refused(path: Path) -> str:
     ("content", "said"),
     [
         (b'{"a": ', "not valid JSON (Expecting value: line 1"),
-        (b"[" * 5_000, "not valid JSON (nested too deeply); repair it"),
-        (b'{"a":' * 5_000, "not valid JSON (nested too deeply)"),
+        (b"[" * 100_000, "not valid JSON (nested too deeply); repair it"),
+        (b'{"a":' * 100_000, "not valid JSON (nested too deeply)"),
         (b"1" * 5_000, "value has 5000 digits); repair it or write it anew."),
         (b"\xff\xfe", "not a text in UTF-8"),
     ],

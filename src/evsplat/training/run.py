@@ -43,7 +43,7 @@ from evsplat.untrusted.faults import brief
 from evsplat.untrusted.records import read_record
 from evsplat.untrusted.text import parse_json, read_text
 
-PACKAGES = ("torch", "numpy", "scipy", "h5py", "pillow", "safetensors")
+PACKAGES = ("numpy", "scipy", "h5py", "pillow", "safetensors")
 
 _FACTS = {"capture": str, "capture_name": str, "device": str, "seed": int}
 """What versions.json must hold."""
@@ -113,7 +113,11 @@ def write_facts(
             "seed": seed,
             "python": platform.python_version(),
             "machine": platform.machine(),
-            "packages": {package: _version_of(package) for package in ("evsplat", *PACKAGES)},
+            "packages": {
+                # With the build, +cpu or a CUDA's, which an installation need not name.
+                "torch": torch.__version__,
+                **{package: _version_of(package) for package in ("evsplat", *PACKAGES)},
+            },
         },
     )
 

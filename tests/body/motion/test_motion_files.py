@@ -221,7 +221,7 @@ def bvh_of(channels: str, frames: str = "1") -> str:
     [
         ("a.txt", '{"Frames": [[1, 2, 3]]}', "expected (T, 44)"),
         ("a.txt", "{}", "not a DeepMimic motion"),
-        ("a.txt", "[" * 5_000, "not a DeepMimic motion (nested too deeply)"),
+        ("a.txt", "[" * 100_000, "not a DeepMimic motion (nested too deeply)"),
         ("a.txt", '{"Frames": [[1' + "0" * 400 + "]]}", "not a DeepMimic motion"),
         ("a.bvh", bvh_of("Wrotation"), "a channel 'Wrotation', expected Xposition to Zrotation"),
         ("a.bvh", bvh_of("Wposition"), "a channel 'Wposition'"),
