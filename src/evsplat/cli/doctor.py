@@ -126,11 +126,9 @@ def _demo() -> Check:
 
 
 def _viewer() -> Check:
-    absent = [part for part in ("viser", "msgspec", "websockets") if find_spec(part) is None]
-    if absent:
-        detail = f"evsplat view, html clips: {', '.join(absent)} not installed."
-        return Check("viewer", "optional", detail, "Get it with: pip install 'evsplat[view]'.")
-    return Check("viewer", "ok", f"viser {_version('viser')}")
+    parts = ("viser", "msgspec", "websockets")
+    found = Check("viewer", "ok", f"viser {_version('viser')}")
+    return _without(parts, "view", "evsplat view, html clips", found)
 
 
 def _body_models() -> Check:
@@ -190,13 +188,18 @@ def _pienet() -> Check:
 
 
 def _recordings() -> Check:
-    name = "event recordings"
     parts = ("hdf5plugin", "rosbags", "zstandard")
+    found = Check("event recordings", "ok", "every format: docs/event-formats.md")
+    return _without(parts, "recordings", "ROS bags, packed HDF5, Zstandard", found)
+
+
+def _without(parts: tuple[str, ...], extra: str, lacking: str, found: Check) -> Check:
+    """``found``, or what is lacking where one of the extra's packages is not installed."""
     absent = [part for part in parts if find_spec(part) is None]
-    if absent:
-        detail = f"ROS bags, packed HDF5, Zstandard: {', '.join(absent)} not installed."
-        return Check(name, "optional", detail, "Get it with: pip install 'evsplat[recordings]'.")
-    return Check(name, "ok", "every format: docs/event-formats.md")
+    if not absent:
+        return found
+    detail = f"{lacking}: {', '.join(absent)} not installed."
+    return Check(found.name, "optional", detail, f"Get it with: pip install 'evsplat[{extra}]'.")
 
 
 def _st_lpips() -> Check:
