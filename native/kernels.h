@@ -128,7 +128,8 @@ struct GaussianGrads {
     KERNEL(SsimSums, ssim_band, (const SsimBand&)) \
     /* Rows [begin, end) of a plane's windows; `line` is a padded row. */ \
     KERNEL(void, window_means, (const WindowMeans&, size_t plane, int begin, int end, double* line)) \
-    KERNEL(void, log_brightness, (const LogBrightness&, size_t begin, size_t end)) \
+    KERNEL(void, log_brightness, (const LogBrightness&, size_t begin, size_t end, float* value)) /* of each picture's pixels */ \
+    KERNEL(void, log_brightness_backward, (const LogBrightness&, size_t begin, size_t end, const float* above, float* const* grads)) \
     KERNEL(void, power, (const Power&, size_t begin, size_t end)) \
     KERNEL(void, power_mean, (const PowerMean&, size_t begin, size_t end)) /* of all planes' values */ \
     KERNEL(void, power_mean_backward, (const PowerMean&, size_t begin, size_t end, const float* above, float* const* grads)) \

@@ -282,10 +282,11 @@ void picture_power(In from, float exponent, Out value, std::optional<Out> slope,
     power({from.data(), exponent, value.data(), data_of(slope)}, from.size(), threads);
 }
 
-// Pictures (H, W, 3), planar in memory.
-PowerMean mean_of(const std::vector<Strided>& pictures, float exponent) {
+// The planes of pictures (H, W, 3), planar in memory, for a job with places for them.
+template <class Job>
+void take_pictures(const std::vector<Strided>& pictures, Job& job) {
     require(!pictures.empty() && pictures.size() <= kMostPictures, "the pictures");
-    PowerMean job = {int(pictures.size()), {}, exponent, 0, nullptr};
+    job.pictures = int(pictures.size());
     for (size_t i = 0; i < pictures.size(); ++i) {
         const Strided& p = pictures[i];
         require(p.ndim() == 3 && p.shape(2) == 3, "a picture");
@@ -294,6 +295,21 @@ PowerMean mean_of(const std::vector<Strided>& pictures, float exponent) {
                 "a picture: planar");
         job.coded[i] = p.data(), job.count = count;
     }
+}
+
+// Where their gradients go, which follow each other.
+template <class Job>
+std::vector<float*> gradients_of(const Job& job, const Out& grads) {
+    require(grads.size() == 3 * job.pictures * job.count, "the gradients");
+    std::vector<float*> to(job.pictures);
+    for (int i = 0; i < job.pictures; ++i) to[i] = grads.data() + 3 * i * job.count;
+    return to;
+}
+
+PowerMean mean_of(const std::vector<Strided>& pictures, float exponent) {
+    PowerMean job = {};
+    take_pictures(pictures, job);
+    job.exponent = exponent;
     return job;
 }
 
@@ -307,11 +323,10 @@ void picture_power_mean(const std::vector<Strided>& pictures, float exponent, Ou
 
 void picture_power_mean_backward(const std::vector<Strided>& pictures, float exponent, In above, Out grads, int threads) {
     const PowerMean job = mean_of(pictures, exponent);
-    require(above.size() == 3 * job.count && grads.size() == job.pictures * above.size(), "the gradients");
-    float* to[kMostPictures];
-    for (int i = 0; i < job.pictures; ++i) to[i] = grads.data() + i * above.size();
+    require(above.size() == 3 * job.count, "the mean's gradient");
+    const std::vector<float*> to = gradients_of(job, grads);
     nb::gil_scoped_release release;
-    power_mean_backward(job, above.data(), threads, to);
+    power_mean_backward(job, above.data(), threads, to.data());
 }
 
 // Whole pictures, or back from their gradient.
@@ -326,18 +341,32 @@ void picture_enlarge(In from, int factor, Out to, bool back, int threads) {
     (back ? enlarge_backward : enlarge)(job, from.data(), threads, to.data());
 }
 
-// Planes (3, pixels).
-void picture_log_brightness(In coded, const std::array<float, 3>& weight, float gamma, float darkest, float eps,
-                            Out value, std::optional<Out> slope, bool keeps_hue, int threads) {
-    const size_t count = value.size();
-    require(coded.size() == 3 * count && (!slope || slope->size() == 3 * count), "the picture");
-    LogBrightness job = {{}, {}, gamma, darkest, eps, value.data(), {}, keeps_hue};
-    for (int c = 0; c < 3; ++c) {
-        job.coded[c] = coded.data() + c * count, job.weight[c] = weight[c];
-        job.slope[c] = slope ? slope->data() + c * count : nullptr;
-    }
+// `curve`: gamma, the darkest value and eps.
+LogBrightness brightness_of(const std::vector<Strided>& pictures, const std::array<float, 3>& weight,
+                            const std::array<float, 3>& curve, bool keeps_hue, bool change, size_t values) {
+    LogBrightness job = {};
+    take_pictures(pictures, job);
+    for (int c = 0; c < 3; ++c) job.weight[c] = weight[c];
+    job.gamma = curve[0], job.darkest = curve[1], job.eps = curve[2], job.keeps_hue = keeps_hue, job.change = change;
+    require(!change || job.pictures == 2, "the pictures: two");
+    require(values == job.count * (change ? 1 : job.pictures), "the logarithms");
+    return job;
+}
+
+void picture_log_brightness(const std::vector<Strided>& pictures, const std::array<float, 3>& weight,
+                            const std::array<float, 3>& curve, bool keeps_hue, bool change, Out value, int threads) {
+    const LogBrightness job = brightness_of(pictures, weight, curve, keeps_hue, change, value.size());
     nb::gil_scoped_release release;
-    log_brightness(job, count, threads);
+    log_brightness(job, threads, value.data());
+}
+
+void picture_log_brightness_backward(const std::vector<Strided>& pictures, const std::array<float, 3>& weight,
+                                     const std::array<float, 3>& curve, bool keeps_hue, bool change, In above, Out grads,
+                                     int threads) {
+    const LogBrightness job = brightness_of(pictures, weight, curve, keeps_hue, change, above.size());
+    const std::vector<float*> to = gradients_of(job, grads);
+    nb::gil_scoped_release release;
+    log_brightness_backward(job, above.data(), threads, to.data());
 }
 
 Skinning skinning(const In& position, const In& weight, const In& bones) {
@@ -430,9 +459,11 @@ NB_MODULE(_native, m) {
           nb::arg("above"), nb::arg("grads"), nb::arg("threads"));
     m.def("enlarge", &picture_enlarge, nb::arg("given"), nb::arg("factor"), nb::arg("to"), nb::arg("back"),
           nb::arg("threads"), "Pictures enlarged bilinearly, or the gradient of the small ones.");
-    m.def("log_brightness", &picture_log_brightness, nb::arg("coded"), nb::arg("weight"), nb::arg("gamma"),
-          nb::arg("darkest"), nb::arg("eps"), nb::arg("value"), nb::arg("slope").none(), nb::arg("keeps_hue"),
-          nb::arg("threads"), "Logarithm of the luminance of (3, H, W) coded values, and its slope by each.");
+    m.def("log_brightness", &picture_log_brightness, nb::arg("pictures"), nb::arg("weight"), nb::arg("curve"),
+          nb::arg("keeps_hue"), nb::arg("change"), nb::arg("value"), nb::arg("threads"),
+          "Logarithm of the luminance of planar pictures' coded values, or its change between two.");
+    m.def("log_brightness_backward", &picture_log_brightness_backward, nb::arg("pictures"), nb::arg("weight"),
+          nb::arg("curve"), nb::arg("keeps_hue"), nb::arg("change"), nb::arg("above"), nb::arg("grads"), nb::arg("threads"));
     m.def("skin", &blend_skin, nb::arg("position"), nb::arg("weight"), nb::arg("bones"), nb::arg("moved"),
           nb::arg("blended"), nb::arg("linear").none(), nb::arg("threads"), "Linear blend skinning.");
     m.def("skin_backward", &blend_skin_backward, nb::arg("position"), nb::arg("weight"), nb::arg("bones"),

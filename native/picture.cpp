@@ -24,9 +24,14 @@ PairOfSums sum_of_pieces(size_t count, int threads, const Work& work) {
 
 }  // namespace
 
-void log_brightness(const LogBrightness& job, size_t count, int threads) {
+void log_brightness(const LogBrightness& job, int threads, float* value) {
     const auto kernel = select_kernels().log_brightness;
-    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) { kernel(job, begin, end); });
+    in_pieces(threads, job.count, kPiece / 4, [&](size_t begin, size_t end) { kernel(job, begin, end, value); });
+}
+
+void log_brightness_backward(const LogBrightness& job, const float* above, int threads, float* const* grads) {
+    const auto kernel = select_kernels().log_brightness_backward;
+    in_pieces(threads, job.count, kPiece / 4, [&](size_t begin, size_t end) { kernel(job, begin, end, above, grads); });
 }
 
 void power(const Power& job, size_t count, int threads) {

@@ -6,20 +6,25 @@
 
 namespace evsplat {
 
-// Natural logarithm of the luminance of `count` pixels whose coded channels are planes:
-// log(sum_c weight_c max(coded_c, darkest)^gamma + eps). `slope` is null or takes its derivative by each
-// channel, which is zero below `darkest`; or, where `keeps_hue`, that of the mean over channels of
-// log(max(coded_c, darkest)^gamma + eps), which pulls at all of them alike.
+constexpr int kMostPictures = 256;
+
+// Natural logarithm of the luminance of pictures of `count` pixels:
+// log(sum_c weight_c max(coded_c, darkest)^gamma + eps). Its slope by a channel is zero below `darkest`; where
+// `keeps_hue` it is that of the mean over channels of log(max(coded_c, darkest)^gamma + eps), which pulls at all of
+// them alike.
 struct LogBrightness {
-    const float* coded[3];
+    int pictures;
+    const float* coded[kMostPictures];  // (3, count) each
+    size_t count;
     float weight[3];
     float gamma, darkest, eps;
-    float* value;
-    float* slope[3];
     bool keeps_hue;
+    bool change;  // not of each picture: of the second of two less that of the first
 };
 
-void log_brightness(const LogBrightness&, size_t count, int threads);
+// (pictures, count), or (count) of a change; back from its gradient `above` it writes those of the pictures, (3, count).
+void log_brightness(const LogBrightness&, int threads, float* value);
+void log_brightness_backward(const LogBrightness&, const float* above, int threads, float* const* grads);
 
 // value = max(from, 0)^exponent for an exponent above 1, over `count` values; `slope` is null or takes the
 // derivative. Both are zero below 1e-6.
@@ -33,7 +38,6 @@ void power(const Power&, size_t count, int threads);
 
 // The mean over pictures of max(coded, 0)^exponent, of their three planes of `count` pixels; zero below 1e-6. Back it
 // writes the pictures' gradients from that of the mean.
-constexpr int kMostPictures = 256;
 struct PowerMean {
     int pictures;
     const float* coded[kMostPictures];  // (3, count) each

@@ -39,6 +39,24 @@ INLINE F membership_of(const Membership& job, F given, I inside, I outside, F& s
     return log2(right) * 0.693147181f + (right - right);  // the logarithm of no number is none
 }
 
+struct Light {
+    F linear[3], slope[3];  // of each channel
+    F sum;                  // weighted, and eps
+};
+
+INLINE Light light_at(const LogBrightness& job, int picture, size_t at, size_t count) {
+    Light light;
+    light.sum = splat(job.eps);
+    for (int c = 0; c < 3; ++c) {
+        const F given = load_some(job.coded[picture] + c * job.count + at, count), coded = max(given, splat(job.darkest));
+        const F power = exp2(log2(coded) * (job.gamma - 1.f));
+        light.linear[c] = power * coded;
+        light.sum += light.linear[c] * job.weight[c];
+        light.slope[c] = select(given >= job.darkest, power * job.gamma, F{});
+    }
+    return light;
+}
+
 }  // namespace
 
 double membership(const Membership& job, size_t begin, size_t end) {
@@ -168,22 +186,32 @@ void power_mean_backward(const PowerMean& job, size_t begin, size_t end, const f
     });
 }
 
-void log_brightness(const LogBrightness& job, size_t begin, size_t end) {
-    vectors(begin, end, PER_VECTOR {
-        F light = splat(job.eps), slope[3], linear[3];
-        for (int c = 0; c < 3; ++c) {
-            const F given = load_some(job.coded[c] + at, count), coded = max(given, splat(job.darkest));
-            const F power = exp2(log2(coded) * (job.gamma - 1.f));
-            linear[c] = power * coded;
-            light += linear[c] * job.weight[c];
-            slope[c] = select(given >= job.darkest, power * job.gamma, F{});
-        }
-        store_some(job.value + at, log2(light) * 0.693147181f, count);
-        for (int c = 0; c < 3 && job.slope[0]; ++c) {
-            const F by = job.keeps_hue ? (1.f / 3.f) / (linear[c] + job.eps) : job.weight[c] / light;
-            store_some(job.slope[c] + at, slope[c] * by, count);
-        }
-    });
+void log_brightness(const LogBrightness& job, size_t begin, size_t end, float* value) {
+    const auto logarithm = [&](int picture, size_t at, size_t count) __attribute__((always_inline)) {
+        return rounded(log2(light_at(job, picture, at, count).sum) * 0.693147181f);
+    };
+    if (job.change) {
+        vectors(begin, end, PER_VECTOR { store_some(value + at, logarithm(1, at, count) - logarithm(0, at, count), count); });
+        return;
+    }
+    for (int i = 0; i < job.pictures; ++i, value += job.count)
+        vectors(begin, end, PER_VECTOR { store_some(value + at, logarithm(i, at, count), count); });
+}
+
+// One picture after the other: their planes may lie so that reading one looks like reading what was just written.
+void log_brightness_backward(const LogBrightness& job, size_t begin, size_t end, const float* above, float* const* grads) {
+    for (int i = 0; i < job.pictures; ++i) {
+        const float* up = above + (job.change ? 0 : i * job.count);
+        const bool less = job.change && !i;
+        vectors(begin, end, PER_VECTOR {
+            const F given = load_some(up + at, count), by_value = less ? -given : given;
+            const Light light = light_at(job, i, at, count);
+            for (int c = 0; c < 3; ++c) {
+                const F by = job.keeps_hue ? (1.f / 3.f) / (light.linear[c] + job.eps) : job.weight[c] / light.sum;
+                store_some(grads[i] + c * job.count + at, light.slope[c] * by * by_value, count);
+            }
+        });
+    }
 }
 
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count, float* grad) {

@@ -62,6 +62,15 @@ INLINE F max(F a, F b) { return (F)_mm256_max_ps((__m256)a, (__m256)b); }
 INLINE F min(F a, F b) { return a < b ? a : b; }
 INLINE F max(F a, F b) { return a > b ? a : b; }
 #endif
+// As it is, so that no product in it becomes one operation with a sum outside: that would round once, not twice.
+INLINE F rounded(F v) {
+#if defined(__x86_64__)
+    asm("" : "+x"(v));
+#elif defined(__aarch64__)
+    asm("" : "+w"(v));
+#endif
+    return v;
+}
 INLINE F select(I mask, F a, F b) { return mask ? a : b; }
 
 INLINE F sqrt(F v) {

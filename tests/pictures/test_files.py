@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evsplat.errors import DataError
-from evsplat.pictures.files import read_image
+from evsplat.pictures.files import read_image, to_unit_range
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -51,3 +51,23 @@ def test_pixels_of_32_bits_are_refused_not_clipped_at_255(
     Image.fromarray(pixels).save(tmp_path / "p.tif")
     with pytest.raises(DataError, match=r"p\.tif: its pixels are .*expected 8 or 16 bits; scale"):
         read_image(tmp_path / "p.tif")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", ["u1", "<u2", ">u2"])
+@pytest.mark.parametrize("lie", ["as stored", "backwards", "planar", "not to be written to"])
+def test_every_level_becomes_its_share_of_the_range_rounded_once(kind: str, lie: str) -> None:
+    levels = np.arange(np.iinfo(kind).max + 1).astype(kind).reshape(-1, 8, 2)
+    if lie == "backwards":
+        levels = levels[::-1, ..., ::-1]
+    elif lie == "planar":
+        levels = np.moveaxis(np.moveaxis(levels, -1, 0).copy(), 0, -1)
+    levels.flags.writeable = lie != "not to be written to"
+    before = levels.copy()
+    shares = (levels.astype(np.float64) / np.iinfo(kind).max).astype(np.float32)
+    found = to_unit_range(levels)
+    assert np.array_equal(found.numpy(), shares)
+    assert (
+        found.stride() == tuple(s // levels.itemsize for s in levels.strides)
+    ) or lie == "backwards"
+    assert np.array_equal(levels, before)

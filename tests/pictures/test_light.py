@@ -90,6 +90,27 @@ def test_compiled_value_and_gradient_equal_the_definition_in_float64(seed, plana
     assert torch.allclose(gradient.double(), expected_gradient, rtol=2e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("eps", [1e-5, 1e-3])
+@pytest.mark.parametrize("planar", [False, True])
+def test_the_compiled_change_and_its_gradients_are_those_of_two_logarithms(planar, eps):
+    generator = torch.Generator().manual_seed(4)
+    pictures = 1.2 * torch.rand(2, 61, 47, 3, generator=generator) - 0.1
+    if planar:
+        pictures = pictures.permute(0, 3, 1, 2).contiguous().permute(0, 2, 3, 1)
+    upstream = torch.randn(61, 47, generator=generator)
+
+    def apart(before, after):
+        return log_brightness(after, eps=eps) - log_brightness(before, eps=eps)
+
+    results = []
+    for function in (lambda a, b: log_brightness_change(a, b, eps=eps), apart):
+        leaves = [picture.clone().requires_grad_() for picture in pictures]
+        value = function(*leaves)
+        results.append((value, *torch.autograd.grad(value, leaves, upstream)))
+    for together, each in zip(*results, strict=True):
+        assert torch.equal(together, each)
+
+
 def test_gradcheck_of_the_change():
     before, after = (
         (0.1 + 0.9 * torch.rand(4, 5, 3, dtype=torch.float64)).requires_grad_() for _ in range(2)

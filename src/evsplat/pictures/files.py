@@ -47,7 +47,14 @@ def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:
     if pixels.dtype == np.float32:
         return torch.from_numpy(pixels.copy(order="K"))
     scale = float(np.iinfo(pixels.dtype).max)
-    return torch.from_numpy(pixels.astype(np.float32) / np.float32(scale))
+    if (
+        not pixels.flags.writeable
+        or not pixels.dtype.isnative
+        or min(pixels.strides, default=0) < 0
+    ):
+        pixels = np.array(pixels, pixels.dtype.newbyteorder("="))  # torch takes no such array
+    # Not by NumPy, whose two passes over a picture take one thread and fresh memory each.
+    return torch.from_numpy(pixels).to(torch.float32).div_(scale)
 
 
 def planar(pixels: np.ndarray) -> np.ndarray:

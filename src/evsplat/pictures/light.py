@@ -127,8 +127,9 @@ class CodedPictures:
         of log(light + eps). It pulls at the logarithms of all channels alike, that of luminance at
         green ten times as hard as at blue.
         """
-        if self._native:
-            result: Tensor = _NativeLogLuminance.apply(eps, keeps_hue, *self.coded[which])
+        coded = self.coded[which]
+        if self._native and len(coded) <= _MOST_PICTURES:
+            result: Tensor = _NativeLogLuminance.apply(_BLACK, eps, keeps_hue, False, *coded)
             return result
         plain: Tensor = _LogLuminance.apply(self._light[which], eps, keeps_hue)
         return plain
@@ -153,6 +154,9 @@ def log_brightness(
 ) -> Float[Tensor, "*shape"]:
     """Natural logarithm of the luminance of sRGB-coded pictures in [0, 1] (A11)."""
     if transfer == "power":
+        if _takes_picture(rgb_srgb):
+            native_result: Tensor = _NativeLogLuminance.apply(DARKEST, eps, False, False, rgb_srgb)
+            return native_result[0]
         result: Tensor = _PowerLogBrightness.apply(rgb_srgb, eps)
         return result
     return torch.log(luminance(decode(rgb_srgb.clamp_min(DARKEST), transfer)) + eps)
@@ -166,8 +170,17 @@ def log_brightness_change(
     transfer: Transfer = "power",
 ) -> Float[Tensor, "*shape"]:
     """``log Y(after) - log Y(before)``, the left side of the event model (paper eq. 8)."""
+    pictures = before_srgb, after_srgb
+    if transfer == "power" and all(map(_takes_picture, pictures)):
+        change: Tensor = _NativeLogLuminance.apply(DARKEST, eps, False, True, *pictures)
+        return change
     after = log_brightness(after_srgb, eps=eps, transfer=transfer)
     return after - log_brightness(before_srgb, eps=eps, transfer=transfer)
+
+
+def _takes_picture(coded: Tensor) -> bool:
+    """Whether the compiled module takes this for a picture."""
+    return runs_native(coded) and coded.ndim == 3 and coded.shape[-1] == len(REC709)
 
 
 class _Power(torch.autograd.Function):
@@ -255,26 +268,32 @@ class _LogLuminance(torch.autograd.Function):
 
 
 class _NativeLogLuminance(torch.autograd.Function):
-    """The same for the power curve in the compiled module; slopes are found at once."""
+    """The same for the power curve in the compiled module, or of two pictures the change.
+
+    Slopes are found on the way back: three planes a picture would else be written and read again.
+    """
 
     @staticmethod
-    def forward(ctx: Any, eps: float, keeps_hue: bool, *coded: Tensor) -> Float[Tensor, "T H W"]:
-        height, width, channels = coded[0].shape
-        value = coded[0].new_empty(len(coded), height, width)
-        slopes = value.new_empty(len(coded), channels, height, width)
-        for picture, at, slope in zip(coded, value, slopes, strict=True):
-            planes = _planar(picture).movedim(-1, 0)
-            native.log_brightness(
-                planes, REC709, GAMMA, _BLACK, eps, at, slope, keeps_hue, torch.get_num_threads()
-            )
-        ctx.save_for_backward(slopes)
+    def forward(
+        ctx: Any, darkest: float, eps: float, keeps_hue: bool, change: bool, *coded: Tensor
+    ) -> Tensor:
+        pictures = [_planar(picture) for picture in coded]
+        size = coded[0].shape[:2]
+        value = pictures[0].new_empty(size if change else (len(coded), *size))
+        ctx.how = REC709, (GAMMA, darkest, eps), keeps_hue, change
+        native.log_brightness(pictures, *ctx.how, value, torch.get_num_threads())
+        ctx.save_for_backward(*coded)
         return value
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (slopes,) = ctx.saved_tensors
-        return None, None, *(slopes * upstream[0][:, None]).movedim(1, -1).unbind(0)
+        pictures = [_planar(picture) for picture in ctx.saved_tensors]
+        height, width, channels = pictures[0].shape
+        grads = pictures[0].new_empty(len(pictures), channels, height, width)
+        above, threads = upstream[0].contiguous(), torch.get_num_threads()
+        native.log_brightness_backward(pictures, *ctx.how, above, grads, threads)
+        return None, None, None, None, *grads.movedim(1, -1).unbind(0)
 
 
 class _PowerEncode(torch.autograd.Function):
@@ -300,17 +319,6 @@ class _PowerLogBrightness(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rgb: Tensor, eps: float) -> Float[Tensor, "*shape"]:
-        if runs_native(rgb) and rgb.shape[-1] == len(REC709):
-            planes = rgb.detach().movedim(-1, 0).contiguous()
-            slopes = torch.empty_like(planes) if ctx.needs_input_grad[0] else None
-            value = torch.empty_like(planes[0])
-            threads = torch.get_num_threads()
-            native.log_brightness(
-                planes, REC709, GAMMA, DARKEST, eps, value, slopes, False, threads
-            )
-            if slopes is not None:
-                ctx.save_for_backward(slopes.movedim(0, -1))
-            return value
         coded = rgb.clamp_min(DARKEST)
         slope = coded ** (GAMMA - 1)
         light = luminance(slope * coded) + eps
