@@ -224,7 +224,7 @@ IsometryMeans isometry(const IsometryInputs& in, int threads, float* gradients) 
             const size_t* at = layout.begin;
             const IsometryInputs one = {1,         in.times,  kRows,     own,       c + at[0], c + at[1],
                                         c + at[2], c + at[3], c + at[4], c + at[5], c + at[6]};
-            const IsometryGrads grads = {g + at[0], g + at[1], g + at[2], g + at[3], g + at[4], g + at[5], g + at[6]};
+            const IsometryGrads grads = {kRows, g + at[0], g + at[1], g + at[2], g + at[3], g + at[4], g + at[5], g + at[6]};
             const Sample sample = {one, grads, own, share};
             sums[s] = {sample.centers(), sample.covariances()};
         }
@@ -234,16 +234,28 @@ IsometryMeans isometry(const IsometryInputs& in, int threads, float* gradients) 
     return {means.centers * share, means.covariances * share};
 }
 
-void isometry_add(const IsometryInputs& in, const float* gradients, float by_centers, float by_covariances,
-                  const IsometryGrads& grads) {
+void isometry_write(const IsometryInputs& in, const float* gradients, float by_centers, float by_covariances, int threads,
+                    const IsometryGrads& grads) {
     const Layout layout(in.times);
     float* arrays[7] = {grads.means,       grads.quaternions,        grads.scales_log, grads.posed_means,
                         grads.posed_quaternions, grads.posed_scales, grads.transforms};
-    for (size_t s = 0; s < in.samples; ++s, gradients += layout.begin[7])
-        layout.rows(in.rows + s * kRows, in.times, in.points, [&](int a, size_t to, size_t from) {
-            const float by = a % 3 == 0 && a < 6 ? by_centers : by_covariances;
-            for (size_t i = 0; i < Layout::kWidth[a]; ++i) arrays[a][to + i] += by * gradients[from + i];
-        });
+    // An array at one time belongs to one thread, which takes the samples in order. The widest come first.
+    const size_t pieces = 3 + 4 * in.times;
+    parallel_for(threads, pieces, [&](size_t piece) {
+        const size_t place = pieces - 1 - piece;
+        const int a = int(place < 3 ? place : 3 + (place - 3) / in.times);
+        const size_t t = place < 3 ? 0 : (place - 3) % in.times, width = Layout::kWidth[a];
+        const size_t points = place < 3 ? grads.canonical_points : in.points;
+        float* to = arrays[a] + t * points * width;
+        std::fill_n(to, points * width, 0.f);
+        const float by = a % 3 == 0 && a < 6 ? by_centers : by_covariances;
+        const float* from = gradients + layout.begin[a] + t * kRows * width;
+        for (size_t s = 0; s < in.samples; ++s, from += layout.begin[7])
+            for (int k = 0; k < kRows; ++k) {
+                float* row = to + in.rows[s * kRows + k] * width;
+                for (size_t i = 0; i < width; ++i) row[i] += by * from[k * width + i];
+            }
+    });
 }
 
 }  // namespace evsplat

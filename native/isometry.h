@@ -19,6 +19,7 @@ struct IsometryInputs {
 
 // Gradients of the two means: `means` of the first, the others of the second.
 struct IsometryGrads {
+    size_t canonical_points;  // at least as many as posed ones
     float *means, *quaternions, *scales_log;
     float *posed_means, *posed_quaternions, *posed_scales, *transforms;
 };
@@ -34,8 +35,9 @@ size_t isometry_floats(size_t times);
 // sample, (samples, isometry_floats).
 IsometryMeans isometry(const IsometryInputs&, int threads, float* gradients);
 
-// Adds them, times those of the two means, to the rows they belong to; of the inputs only `rows` are read.
-void isometry_add(const IsometryInputs&, const float* gradients, float by_centers, float by_covariances,
-                  const IsometryGrads&);
+// Writes them, times those of the two means, summed by the rows they belong to, with zeros elsewhere; of the inputs only
+// `rows` are read.
+void isometry_write(const IsometryInputs&, const float* gradients, float by_centers, float by_covariances, int threads,
+                    const IsometryGrads&);
 
 }  // namespace evsplat

@@ -123,16 +123,19 @@ std::pair<double, double> py_isometry(Index rows, const std::vector<In>& arrays,
     return {means.centers, means.covariances};
 }
 
-void py_isometry_add(Index rows, In gradients, float by_centers, float by_covariances, const std::vector<Out>& grads) {
+void py_isometry_write(Index rows, In gradients, float by_centers, float by_covariances, const std::vector<Out>& grads,
+                       int threads) {
     require(grads.size() == 7 && grads[3].ndim() == 3, "the gradients");
-    const size_t times = grads[3].shape(0), points = grads[3].shape(1);
+    const size_t times = grads[3].shape(0), points = grads[3].shape(1), all = grads[0].size() / 3;
     check_isometry(grads, times, points);
+    for (int i = 0; i < 3; ++i) require(grads[i].size() == all * kIsometryWidth[i], "the gradients");
     const IsometryInputs in = isometry_inputs(rows, times, points);
     require(gradients.size() == in.samples * isometry_floats(times), "the gradients");
-    const IsometryGrads out = {grads[0].data(), grads[1].data(), grads[2].data(), grads[3].data(),
+    const IsometryGrads out = {all,
+                               grads[0].data(), grads[1].data(), grads[2].data(), grads[3].data(),
                                grads[4].data(), grads[5].data(), grads[6].data()};
     nb::gil_scoped_release release;
-    isometry_add(in, gradients.data(), by_centers, by_covariances, out);
+    isometry_write(in, gradients.data(), by_centers, by_covariances, threads, out);
 }
 
 void py_view_directions(In positions, std::optional<In> transforms, const std::array<float, 3>& center,
@@ -312,8 +315,8 @@ void evsplat::bind_step(nb::module_& m) {
     m.def("isometry_floats", &isometry_floats, nb::arg("times"), "Of the gradients of one sample.");
     m.def("isometry", &py_isometry, nb::arg("rows"), nb::arg("arrays"), nb::arg("gradients"), nb::arg("threads"),
           "Mean change of neighbours' distances and covariances; writes the gradients by sample.");
-    m.def("isometry_add", &py_isometry_add, nb::arg("rows"), nb::arg("gradients"), nb::arg("by_centers"),
-          nb::arg("by_covariances"), nb::arg("grads"), "Adds the samples' gradients to those of the arrays.");
+    m.def("isometry_write", &py_isometry_write, nb::arg("rows"), nb::arg("gradients"), nb::arg("by_centers"),
+          nb::arg("by_covariances"), nb::arg("grads"), nb::arg("threads"), "The arrays' gradients, from the samples'.");
     m.def("view_directions", &py_view_directions, nb::arg("positions"), nb::arg("transforms").none(),
           nb::arg("center"), nb::arg("turn"), nb::arg("directions"), nb::arg("threads"),
           "Unit vectors from a centre, turned back by transforms and then by one matrix.");

@@ -75,8 +75,9 @@ class _NativeIsometry(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        grads = [torch.zeros(shape) for shape in ctx.shapes]
-        native.isometry_add(*ctx.saved_tensors, *map(float, upstream), grads)
+        grads = [torch.empty(shape) for shape in ctx.shapes]
+        slopes = map(float, upstream)
+        native.isometry_write(*ctx.saved_tensors, *slopes, grads, torch.get_num_threads())
         return None, *grads
 
 
@@ -118,13 +119,16 @@ class Isometry(LookedUp):
 
         at_rest = (gaussians.means, gaussians.quaternions, gaussians.scales_log)
         # Two of the times are enough: a step's lie close to each other.
-        every = -(-len(posed.means) // MOST_TIMES)
+        times = len(posed.means)
+        every = -(-times // MOST_TIMES)
         moved = (
-            posed.means[::every],
+            posed.means,
             # What is the same at all times may have an axis of one.
-            posed.quaternions.expand(len(posed.means), -1, -1)[::every],
-            posed.scales.expand(len(posed.means), -1, -1)[::every],
-            step.layers.transforms[::every],
+            posed.quaternions.expand(times, -1, -1),
+            posed.scales.expand(times, -1, -1),
+            step.layers.transforms,
         )
+        if every > 1:  # else a slice of all is made, whose gradient autograd copies
+            moved = tuple(part[::every] for part in moved)
         centers, covariances = isometry_change(rows, at_rest, moved)
         return {"isometry_centers": centers, "isometry_covariances": covariances}
