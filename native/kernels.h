@@ -133,6 +133,7 @@ struct GaussianGrads {
     KERNEL(void, power, (const Power&, size_t begin, size_t end)) \
     KERNEL(void, power_mean, (const PowerMean&, size_t begin, size_t end)) /* of all planes' values */ \
     KERNEL(void, power_mean_backward, (const PowerMean&, size_t begin, size_t end, const float* above, float* const* grads)) \
+    KERNEL(void, share_of_range, (const uint8_t*, size_t, float*)) \
     KERNEL(void, add_sign, (const float*, const float*, float, float, size_t, float*)) \
     KERNEL(double, membership, (const Membership&, size_t begin, size_t end)) /* begin: a multiple of 16 */ \
     KERNEL(double, misfit, (const Misfit&, size_t begin, size_t end)) \

@@ -269,6 +269,12 @@ void ssim_window_means(Array<const double> planes, Column<const double> window, 
     window_means(job, planes.shape(0), threads);
 }
 
+void picture_share_of_range(Array<const uint8_t> levels, Out shares, int threads) {
+    require(shares.size() == levels.size(), "the shares");
+    nb::gil_scoped_release release;
+    share_of_range(levels.data(), levels.size(), threads, shares.data());
+}
+
 void picture_add_sign(In image, In reference, float by_difference, float scale, Out grad, int threads) {
     require(image.size() == reference.size() && grad.size() == image.size(), "the pictures");
     nb::gil_scoped_release release;
@@ -448,6 +454,8 @@ NB_MODULE(_native, m) {
           "Sums of the structural similarity, whose gradient it writes, and of absolute differences.");
     m.def("window_means", &ssim_window_means, nb::arg("planes"), nb::arg("window"), nb::arg("pad"), nb::arg("means"),
           nb::arg("threads"), "Weighted means in the windows of planes with zeros around them, float64.");
+    m.def("share_of_range", &picture_share_of_range, nb::arg("levels"), nb::arg("shares"), nb::arg("threads"),
+          "Values of 8 bits as shares of their range.");
     m.def("add_sign", &picture_add_sign, nb::arg("image"), nb::arg("reference"), nb::arg("by_difference"),
           nb::arg("scale"), nb::arg("grad"), nb::arg("threads"),
           "grad = by_difference * sign(image - reference) + scale * grad.");

@@ -110,6 +110,11 @@ void enlarge_backward(const Enlarge& e, const float* above, int threads, float* 
     });
 }
 
+void share_of_range(const uint8_t* levels, size_t count, int threads, float* shares) {
+    const auto kernel = select_kernels().share_of_range;
+    in_pieces(threads, count, kPiece, [&](size_t begin, size_t end) { kernel(levels + begin, end - begin, shares + begin); });
+}
+
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad) {
     const auto kernel = select_kernels().add_sign;

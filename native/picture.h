@@ -59,6 +59,9 @@ struct Enlarge {
 void enlarge(const Enlarge&, const float* from, int threads, float* to);
 void enlarge_backward(const Enlarge&, const float* above, int threads, float* grad);
 
+// `count` values of 8 bits as shares of their range, [0, 1].
+void share_of_range(const uint8_t* levels, size_t count, int threads, float* shares);
+
 // grad = by_difference * sign(image - reference) + scale * grad, over `count` values.
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count,
               int threads, float* grad);

@@ -24,9 +24,9 @@ INLINE I mask_at(const uint8_t* packed, size_t at, size_t count) {
     if (W > 8) word = word << 8 | (count > 8 ? packed[at / 8 + 1] : 0);
     word <<= at % 8;
     if (count < size_t(W)) word &= ~0u << (bits - count);
-    I lanes;
-    for (int l = 0; l < W; ++l) lanes[l] = -int32_t(word >> (bits - 1 - l) & 1);
-    return lanes;
+    I place;
+    for (int l = 0; l < W; ++l) place[l] = bits - 1 - l;
+    return -((int32_t(word) - I{}) >> place & 1);
 }
 
 INLINE F membership_of(const Membership& job, F given, I inside, I outside, F& slope) {
@@ -212,6 +212,11 @@ void log_brightness_backward(const LogBrightness& job, size_t begin, size_t end,
             }
         });
     }
+}
+
+void share_of_range(const uint8_t* levels, size_t count, float* shares) {
+#pragma GCC ivdep
+    for (size_t i = 0; i < count; ++i) shares[i] = float(levels[i]) / 255.f;
 }
 
 void add_sign(const float* image, const float* reference, float by_difference, float scale, size_t count, float* grad) {

@@ -129,6 +129,7 @@ class Isometry(LookedUp):
             step.layers.transforms,
         )
         if every > 1:  # else a slice of all is made, whose gradient autograd copies
-            moved = tuple(part[::every] for part in moved)
+            means, quaternions, scales, transforms = (part[::every] for part in moved)
+            moved = means, quaternions, scales, transforms
         centers, covariances = isometry_change(rows, at_rest, moved)
         return {"isometry_centers": centers, "isometry_covariances": covariances}
