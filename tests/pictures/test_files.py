@@ -43,6 +43,25 @@ def test_a_bitmap_with_16_bits_of_all_colours_reaches_black_and_white(
     assert np.abs(read - levels * 255 / (31, 63, 31)).max() <= 1
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("plain", [False, True])
+@pytest.mark.parametrize("most", [255, 256, 1_023, 65_535])
+def test_a_portable_map_keeps_its_depth_whatever_its_greatest_value(
+    rng: np.random.Generator, tmp_path: Path, channels: int, plain: bool, most: int
+) -> None:
+    levels = rng.integers(0, most, (5, 7, channels), endpoint=True)
+    levels[0, 0], levels[-1, -1] = 0, most
+    magic = {(1, True): "P2", (3, True): "P3", (1, False): "P5", (3, False): "P6"}
+    stored = levels.astype(">u2" if most > 255 else "u1")
+    body = " ".join(map(str, levels.ravel())).encode() if plain else stored.tobytes()
+    path = tmp_path / "p.pnm"
+    path.write_bytes(f"{magic[channels, plain]}\n7 5\n{most}\n".encode() + body)
+    read = read_image(path)
+    assert read.dtype == (np.uint16 if most > 255 else np.uint8)
+    expected = levels / most * np.iinfo(read.dtype).max
+    assert np.abs(read.reshape(levels.shape) - expected).max() <= 1
+
+
 @pytest.mark.parametrize("kind", ["f4", "i4"])
 def test_pixels_of_32_bits_are_refused_not_clipped_at_255(
     rng: np.random.Generator, tmp_path: Path, kind: str

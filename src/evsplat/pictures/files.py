@@ -16,7 +16,6 @@ from PIL import Image
 from PIL.TiffImagePlugin import BITSPERSAMPLE, TiffImageFile
 from torch import Tensor
 
-from evsplat.compiled import native
 from evsplat.errors import DataError
 from evsplat.files import atomic_path, open_output
 from evsplat.untrusted.pictures import read_16_bit_colour, read_picture
@@ -47,12 +46,6 @@ def to_unit_range(pixels: np.ndarray) -> Float[Tensor, "..."]:
     """Float32 in [0, 1] of stored pixels; float pixels are taken to be in that range already."""
     if pixels.dtype == np.float32:
         return torch.from_numpy(pixels.copy(order="K"))
-    planes = np.moveaxis(pixels, -1, 0) if pixels.ndim == 3 else pixels
-    if native is not None and pixels.dtype == np.uint8 and planes.flags.c_contiguous:
-        # Training asks at each step; NumPy would take one thread and two passes.
-        shares = torch.empty(planes.shape)
-        native.share_of_range(planes, shares, torch.get_num_threads())
-        return shares.movedim(0, -1) if pixels.ndim == 3 else shares
     scale = float(np.iinfo(pixels.dtype).max)
     return torch.from_numpy(pixels.astype(np.float32) / np.float32(scale))
 
@@ -139,6 +132,8 @@ def _save_png(path: Path, pixels: np.ndarray) -> None:
 
 def _pixels(path: Path, image: Image.Image) -> np.ndarray | None:
     """None for 16 bits per colour, which Pillow would cut to 8."""
+    if image.mode == "I" and image.format == "PPM":  # of at most 16 bits, scaled to 0..65535
+        return np.array(image).astype(np.uint16)
     if image.mode in ("I", "F"):  # Pillow would clip both at 255
         kind = "whole numbers of 32 bits" if image.mode == "I" else "floating-point numbers"
         raise DataError(
@@ -159,10 +154,10 @@ def _has_16_bits(image: Image.Image) -> bool:
         return False
     if isinstance(image, TiffImageFile):  # a packed one's tiles do not say it
         return max(image.tag_v2.get(BITSPERSAMPLE, (8,))) > 8
-    return any(
-        "16" in str(tile[3][0] if isinstance(tile[3], tuple) else tile[3])
-        for tile in getattr(image, "tile", [])
-    )
+    packings = [tile[3] for tile in getattr(image, "tile", [])]
+    if image.format == "PPM":  # its greatest value is said where it is not 255
+        return any(isinstance(packed, tuple) and packed[-1] > 255 for packed in packings)
+    return any("16" in str(one[0] if isinstance(one, tuple) else one) for one in packings)
 
 
 def _eight_bits(pixels: np.ndarray, source: str) -> np.ndarray:
