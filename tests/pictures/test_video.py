@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.pictures.video import write_pictures, write_video
+from evsplat.pictures.video import write_animation, write_pictures, write_video
 
 
 def _flat_pictures(count: int, height: int, width: int) -> list[np.ndarray]:
@@ -142,10 +142,20 @@ def test_folder_with_files_is_refused_unless_ours(tmp_path):
 def test_no_picture_and_impossible_rates_are_refused(tmp_path):
     with pytest.raises(DataError, match="no picture"):
         write_video(tmp_path / "a.mp4", [], fps=10)
-    for fps in (0.0, -1.0, float("nan"), 1e6):
-        with pytest.raises(ConfigError, match="--fps"):
+    for fps in (0.0, -1.0, float("nan"), 1e6, 1e-4):
+        with pytest.raises(ConfigError, match=r"--fps .*: expected from 0\.01 to 1000 Hz"):
             write_video(tmp_path / "a.mp4", _flat_pictures(1, 8, 8), fps=fps)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "most"), [("a.gif", 50), ("a.webp", 1_000)])
+def test_animations_take_rates_that_their_format_holds(tmp_path, name, most):
+    for fps in (0.0, 1e-4, 0.0099, most + 0.1, float("inf"), float("nan")):
+        with pytest.raises(ConfigError, match=rf"--fps .*: expected from 0\.01 to {most} Hz"):
+            write_animation(tmp_path / name, _flat_pictures(2, 8, 8), fps=fps)
+    assert not list(tmp_path.iterdir())
+    for fps in (0.01, most):
+        assert write_animation(tmp_path / name, _flat_pictures(2, 8, 8), fps=fps) == 2
 
 
 @pytest.mark.parametrize("name", ["../a", "/tmp/evsplat-a", "a/b", "a\\b", "..", "", "a" * 201])

@@ -17,6 +17,8 @@ from evsplat.names import checked_name
 
 _BT709 = 1
 _LIMITED_RANGE = 1
+_SLOWEST_HZ = 0.01
+"""A GIF's picture stands 655 s at most, and a video below 1/1000 Hz would be played at 24."""
 
 
 def write_video(
@@ -30,15 +32,14 @@ def write_video(
 ) -> int:
     """Encode sRGB pictures as an mp4 (H.264, yuv420p, BT.709) and return how many there were.
 
-    Odd sizes are made even by repeating the last row or column, as yuv420p asks for. ``fps`` is
-    the playing speed in pictures per second; ``crf`` is x264's quality, lower is better (16 is
-    hard to tell from the original), ``preset`` its effort. Each pixel is shown ``enlarged`` times
-    as wide and as high, so that small pictures stay sharp and keep their colours.
+    Odd sizes are made even by repeating the last row or column, as yuv420p asks for. ``fps`` is the
+    playing speed in pictures per second, 0.01 to 1000; ``crf`` is x264's quality, lower is better
+    (16 is hard to tell from the original), ``preset`` its effort. Each pixel is shown ``enlarged``
+    times as wide and as high, so that small pictures stay sharp and keep their colours.
     """
     import av
 
-    if not 0 < fps <= 1000:
-        raise ConfigError(f"--fps {fps:g}: expected a frame rate above 0 and at most 1000 Hz.")
+    _check_rate(fps, 1000, "video")
     if "libx264" not in av.codecs_available:
         raise BackendError(
             "The installed PyAV has no H.264 encoder (libx264): install the wheel with "
@@ -56,6 +57,13 @@ def write_video(
         if not count:
             raise DataError(f"{path}: there is no picture to write.")
     return count
+
+
+def _check_rate(fps: float, most_hz: float, kind: str) -> None:
+    if not _SLOWEST_HZ <= fps <= most_hz:
+        raise ConfigError(
+            f"--fps {fps:g}: expected from {_SLOWEST_HZ:g} to {most_hz:g} Hz of a {kind}."
+        )
 
 
 def _encode(
@@ -120,6 +128,7 @@ def write_animation(
 ) -> int:
     """Write a .webp or .gif that plays for ever and return how many pictures there were.
 
+    ``fps`` is from 0.01 to 1000 pictures per second, or to 50 of a GIF.
     RGBA keeps its transparency: all of it in WebP, one bit in GIF. WebP is lossy at a quality that
     is hard to tell from the original; GIF has 255 colours per picture and counts time in 1/100 s,
     so that pictures of some rates stand unequally long but the whole is as long as it should be.
@@ -128,8 +137,7 @@ def write_animation(
     kind = path.suffix.lower()
     if kind not in (".gif", ".webp"):
         raise ConfigError(f"{path}: animations end in .webp or .gif.")
-    if not 0 < fps <= (50 if kind == ".gif" else 1000):
-        raise ConfigError(f"--fps {fps:g}: expected above 0 Hz, at most 50 for .gif, 1000 else.")
+    _check_rate(fps, 50 if kind == ".gif" else 1000, kind)
     with atomic_path(path) as temporary:
         count = (_write_gif if kind == ".gif" else _write_webp)(temporary, pictures, fps)
         if not count:
