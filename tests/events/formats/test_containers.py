@@ -202,6 +202,27 @@ def test_ros1_bag_of_event_arrays(tmp_path: Path) -> None:
         open_recording(tmp_path / "cut.bag")
 
 
+def test_nanoseconds_of_a_bag_are_rounded_to_the_nearest_microsecond(tmp_path: Path) -> None:
+    s = random_stream(29, 400, first_us=1_600_000_000_000_000)
+    rest_ns = np.random.default_rng(30).integers(-500, 500, len(s))
+    rest_ns[:2] = -500, 499  # a half goes upwards
+    times_ns = np.sort(s.t * 1000 + rest_ns)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(EVENT_MSG.format(time="time"), "dvs_msgs/msg/Event"))
+    store.register(get_types_from_msg(ARRAY_MSG, "dvs_msgs/msg/EventArray"))
+    event, time = store.types["dvs_msgs/msg/Event"], store.types["builtin_interfaces/msg/Time"]
+    rows = zip(times_ns.tolist(), encoders.rows(s), strict=True)
+    events = [
+        event(x=x, y=y, ts=time(*divmod(t_ns, 10**9)), polarity=on) for t_ns, (_, x, y, on) in rows
+    ]
+    message = store.types["dvs_msgs/msg/EventArray"](_header(store), HEIGHT, WIDTH, events)
+    with BagWriter(tmp_path / "e.bag") as bag:
+        topic = bag.add_connection("/dvs/events", "dvs_msgs/msg/EventArray", typestore=store)
+        bag.write(topic, 1, store.serialize_ros1(message, "dvs_msgs/msg/EventArray"))
+    read = read_events(tmp_path / "e.bag")
+    assert np.array_equal(read.t, np.floor_divide(times_ns + 500, 1000))
+
+
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 @pytest.mark.parametrize("packets", [False, True])
 def test_ros2_folder_and_single_file(tmp_path: Path, storage: StoragePlugin, packets: bool) -> None:

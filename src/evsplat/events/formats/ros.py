@@ -140,7 +140,9 @@ def _begins_anew(before: _Message, after: _Message) -> str | None:
 
 def _array(message: _Message) -> RawEvents:
     events = np.frombuffer(message.events, message.kind)
-    t = events["seconds"].astype(np.int64) * 1_000_000 + events["nanoseconds"] // 1000
+    # halves upwards, as nanoseconds of tables and texts are rounded
+    rest_us = (events["nanoseconds"].astype(np.int64) + 500) // 1000
+    t = events["seconds"].astype(np.int64) * 1_000_000 + rest_us
     return RawEvents(t, events["x"], events["y"], events["p"])
 
 
