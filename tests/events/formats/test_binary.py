@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from evsplat.errors import DataError
 from evsplat.events import EventStream, open_recording, read_events
+from evsplat.events.formats import aedat3
+from evsplat.events.formats.base import ByteReader
 
 from . import encoders
 from .helpers import HEIGHT, WIDTH, random_stream, same
@@ -200,6 +202,28 @@ def test_of_two_cameras_in_aedat3_one_gives_size_events_and_frames(
     assert same(recording.read(), s)
     assert [int(frame.image[0, 0]) for frame in recording.frames()] == [200]
     assert any("only events of source 1 are read" in note for note in recording.notes)
+
+
+def test_aedat3_without_frames_is_gone_through_once_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "e.aedat"
+    data = encoders.aedat3(random_stream(3, 900), WIDTH, HEIGHT, sensor="DAVIS346")
+    without = data[: data.rindex(encoders.aedat3_frame_info(1)) - 28]
+    path.write_bytes(without)
+    recording = open_recording(path)
+    passes: list[int] = []
+
+    class Counted(ByteReader):
+        def __init__(self, path: Path, start: int = 0) -> None:
+            super().__init__(path, start)
+            passes.append(start)
+
+    monkeypatch.setattr(aedat3, "ByteReader", Counted)
+    assert list(recording.frames()) == [] and len(passes) == 1
+    path.write_bytes(without[:-3])
+    with pytest.raises(DataError, match="ends in the middle of a packet"):
+        list(open_recording(path).frames())
 
 
 def test_two_recordings_of_aedat3_in_one_file_are_refused(tmp_path: Path) -> None:

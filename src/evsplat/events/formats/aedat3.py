@@ -57,6 +57,7 @@ class Aedat3(Source):
 
     def read_header(self, options: ReadOptions) -> None:
         """See `Source`."""
+        self._kinds: set[int] = set()
         lines = self._lines()
         packing = _value(lines, "Format")
         if packing not in (None, "RAW"):
@@ -101,7 +102,10 @@ class Aedat3(Source):
         return self._frames(self.damage)
 
     def _frames(self, damage: Damage) -> Iterator[RecordedFrame]:
-        own = next(self._packets(_FRAME, Damage(self.path, repair=True), self._source), None)
+        ahead = Damage(self.path, repair=True)
+        own = next(self._packets(_FRAME, ahead, self._source), None)
+        if own is None and _FRAME not in self._kinds and not ahead.counts:
+            return  # seen to the end already, and whole: another pass would find nothing
         source = None if own is None else self._source
         for offset, head, body in self._packets(_FRAME, damage, source):
             if head["size"] < _FRAME_HEAD.itemsize:
@@ -180,6 +184,7 @@ class Aedat3(Source):
                 if data.startswith(MAGIC):
                     raise two_recordings(self.path, offset, zipped=reader.zipped)
                 head = np.frombuffer(data, _HEAD)[0] if len(data) == _HEAD.itemsize else None
+                self._kinds.add(-1 if head is None else int(head["kind"]))
                 size = -1 if head is None else int(head["size"]) * int(head["number"])
                 sound = head is not None and head["number"] >= 0 and head["size"] > 0
                 if head is not None and sound and size <= _MAX_PACKET_BYTES:
