@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from evsplat.untrusted.pictures import read_picture
+from evsplat.wording import counted
 
 _LOSSLESS_PIXELS = 6_000_000
 """Up to this many pixels in all, pictures are embedded without loss; beyond, at quality 92."""
@@ -42,9 +43,10 @@ def folded(title: str, body: str) -> str:
     return f"<details><summary>{escape(title)}</summary>{body}</details>" if body else ""
 
 
-def more(shown: int, rest: int, items: str) -> str:
+def more(shown: int, rest: int, item: str) -> str:
     """Title of folded items: all of the rest, or so many of it."""
-    return f"{shown} more {items}" if shown == rest else f"{shown} of {rest} more {items}"
+    some = "" if shown == rest else f"{shown} of "
+    return some + counted(rest, f"more {item}")
 
 
 def compare(left: str, right: str, caption: str) -> str:

@@ -23,7 +23,9 @@ from evsplat.evaluation.report.charts import Series, line_chart
 from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import name_of
+from evsplat.evaluation.tables import write_tables
 from evsplat.files import write_json
+from evsplat.pages import more
 
 from .helpers import TruthWithNoise, drop, edit
 
@@ -171,6 +173,19 @@ def test_page_shows_every_test_frame_pair_and_view(tiny_capture, tmp_path):
     assert sum(attributes.get("type") == "range" for _, attributes in parsed.elements) == 2 * len(
         source.capture.test_frames
     )
+
+
+def test_one_frame_and_one_view_are_told_in_the_singular(tiny_capture, tmp_path):
+    source = evaluated(tiny_capture(frames=8), tmp_path)
+    assert len(source.capture.test_frames) == len(source.capture.novel_views) == 1
+    text = " ".join(Page(page(source)).text)
+    assert "Means over 1 held-out frame against" in text and "mean of 1 view" in text
+    write_tables(tmp_path, source.metrics)
+    assert "Means over 1 held-out frame against" in (tmp_path / "metrics.md").read_text("utf-8")
+    told = (text, (tmp_path / "metrics.md").read_text("utf-8"), more(1, 1, "pair"))
+    wrong = re.compile(r"\b1 (?:\S+ )?(?:frame|view|pair)s")
+    assert not [one for one in told if wrong.search(one)]
+    assert more(1, 3, "pair") == "1 of 3 more pairs"
 
 
 @pytest.mark.parametrize("split", ["test", "train"])

@@ -55,6 +55,16 @@ def test_summary_states_what_was_recorded(tiny_capture: Factory, tmp_path: Path)
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_one_of_a_kind_is_told_in_the_singular(tiny_capture: Factory, tmp_path: Path) -> None:
+    path = tiny_capture(frames=8)
+    document = json.loads((path / "capture.json").read_text())
+    for frame in document["frames"][1:]:
+        del frame["mask"]
+    (path / "capture.json").write_text(json.dumps(document))
+    assert "8 sharp, 1 mask, 1 novel view (side 1)" in inspect_capture(path, tmp_path).summary
+
+
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("longest_us", [32_000, 60_000])
 @pytest.mark.parametrize("skipped", [0, 3])
 def test_summary_tells_times_that_differ_from_frame_to_frame(

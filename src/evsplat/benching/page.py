@@ -15,6 +15,7 @@ from evsplat.pages import Embedder, document, folded, read_rgb, section
 from evsplat.pictures import to_bytes
 from evsplat.pictures.box import Box
 from evsplat.spread import evenly_spread
+from evsplat.wording import counted
 
 _PIXELS = 60_000_000
 """Pixels of all pictures of the page; beyond, captures show fewer frames, evenly spread."""
@@ -82,14 +83,14 @@ def _capture(
     }
     others = "".join(draw[frame.name] for frame in frames if frame not in shown)
     left = len(capture.test_frames) - len(frames)
-    intro = f"{left} more test frames are measured but not shown. " if left else ""
+    intro = f"Measured but not shown: {counted(left, 'more test frame')}. " if left else ""
     return section(
         escape(name),
         intro + "PSNR of the person crop, protocol standard.",
         '<div class="switch"><label for="person"><span class="near">show whole pictures</span>'
         '<span class="whole">show the person only</span></label></div>'
         + "".join(draw[frame.name] for frame in shown)
-        + folded(f"{len(frames) - len(shown)} more test frames", others),
+        + folded(counted(len(frames) - len(shown), "more test frame"), others),
     )
 
 

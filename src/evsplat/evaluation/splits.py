@@ -4,13 +4,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from evsplat.options.runs import Split
+from evsplat.wording import counted
 
 
 @dataclass(frozen=True)
 class SplitWords:
     """How tables and pages speak of the frames of a split."""
 
-    frames: str
+    frame: str
+    """One of them."""
     title: str
     headline: str
     """Where a figure of the full frame was reached."""
@@ -20,13 +22,13 @@ class SplitWords:
 
 WORDS: dict[Split, SplitWords] = {
     "test": SplitWords(
-        "held-out frames",
+        "held-out frame",
         "Test frames",
         "on held-out frames",
         "blurry input itself (no method sees it)",
     ),
     "train": SplitWords(
-        "training frames",
+        "training frame",
         "Training frames",
         "on training frames",
         "blurry input itself (training saw it)",
@@ -48,6 +50,11 @@ def count_of(metrics: dict[str, Any]) -> int:
     """The number of frames that were measured."""
     count: int = metrics["frames"][split_of(metrics)]
     return count
+
+
+def counted_frames(metrics: dict[str, Any]) -> str:
+    """So many frames were measured, such as "9 held-out frames"."""
+    return counted(count_of(metrics), words_of(metrics).frame)
 
 
 def name_of(stem: str, split: Split, suffix: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from evsplat.capture.policy import terms_of
-from evsplat.evaluation.splits import count_of, name_of, split_of, words_of
+from evsplat.evaluation.splits import count_of, counted_frames, name_of, split_of, words_of
 from evsplat.files import write_text
 
 ROW_TITLES = {
@@ -220,10 +220,7 @@ def without_truth(metrics: dict[str, Any]) -> str | None:
     rows = [metrics["protocols"]["standard"], metrics.get("blurry_input") or {}]
     if not count_of(metrics) or any(row.get("full", {}).get("psnr") is not None for row in rows):
         return None
-    return (
-        f"Of {count_of(metrics)} {words_of(metrics).frames} none has a sharp picture to be "
-        "compared with."
-    )
+    return f"Of {counted_frames(metrics)} none has a sharp picture to be compared with."
 
 
 def input_is_truth(metrics: dict[str, Any]) -> bool:
@@ -256,8 +253,7 @@ def write_tables(folder: Path, metrics: dict[str, Any]) -> None:
     tables = tables_of(metrics) if count and not why else []
     if views := metrics["novel_views"]:
         tables.append(_table("Novel views", "Protocol standard.", views, {}))
-    frames = words.title.lower()
-    means = f"Means over {count} {frames} against the sharp truth." if count else None
+    means = f"Means over {counted_frames(metrics)} against the sharp truth." if count else None
     legend = LEGEND.format(second="in italics") if tables else None
     intro = " ".join(filter(None, (why or means, terms(metrics), legend)))
     title = f"{metrics['method']} on {metrics['capture']}"

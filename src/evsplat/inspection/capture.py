@@ -44,6 +44,7 @@ from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings
 from evsplat.inspection.summary import findings_text, summary_text
 from evsplat.spread import evenly_spread
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -164,7 +165,7 @@ def _contact_sheet(capture: Capture) -> Image.Image:
         )
         tiles.append(Tile(picture, _label(frame), frame.split))
     some = "" if len(chosen) == len(capture.frames) else f"{len(chosen)} of "
-    subtitle = f"{some}{len(capture.frames)} frames as the camera saw them"
+    subtitle = f"{some}{counted(len(capture.frames), 'frame')} as the camera saw them"
     return sheet(f"{capture.name}: frames", subtitle, tiles, columns=8)
 
 

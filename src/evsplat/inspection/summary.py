@@ -155,7 +155,7 @@ def _body_text(capture: Capture, track: BodyTrack | None) -> str:
         f"vertices; {counted(len(times), 'key pose')} from {times[0] / 1e6:.3f} to "
         f"{times[-1] / 1e6:.3f} s"
         + ("" if track.errors is None else f", {track.errors.source}")
-        + (f"; {len(dense.times_us)} dense true poses" if dense is not None else "")
+        + (f"; {counted(len(dense.times_us), 'dense true pose')}" if dense is not None else "")
     )
 
 
@@ -186,8 +186,8 @@ def _truth_text(capture: Capture) -> str:
     masks = sum(frame.mask is not None for frame in capture.frames)
     novel = [view.camera for view in capture.novel_views]
     by_camera = ", ".join(f"{name} {novel.count(name)}" for name in sorted(set(novel)))
-    views = f"{len(novel)} novel views" + (f" ({by_camera})" if novel else "")
-    return f"{sharp} sharp, {masks} masks, {views}"
+    views = counted(len(novel), "novel view") + (f" ({by_camera})" if novel else "")
+    return f"{sharp} sharp, {counted(masks, 'mask')}, {views}"
 
 
 def findings_text(findings: tuple[Finding, ...]) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from evsplat.capture.policy import terms_of
 from evsplat.evaluation.report.source import Source
-from evsplat.evaluation.splits import count_of, split_of, words_of
+from evsplat.evaluation.splits import counted_frames, split_of
 from evsplat.evaluation.tables import (
     REGION_TITLES,
     Table,
@@ -40,9 +40,8 @@ def figures(source: Source) -> str:
         if against is not None and not input_is_truth(metrics)
         else ""
     )
-    count, frames = count_of(metrics), words_of(metrics).frames
     measured = without_truth(metrics) or (
-        f"Means over {count} {frames} against the sharp picture at mid-exposure."
+        f"Means over {counted_frames(metrics)} against the sharp picture at mid-exposure."
     )
     return section(
         "Figures",

@@ -76,7 +76,7 @@ def test_frames(source: Source) -> str:
         _terms(source.metrics, chosen),
         (scale if any("error" in one.pictures for one in chosen) else "")
         + "".join(_test_frame(one, embed) for one in shown)
-        + folded(more(len(others), len(entries) - len(shown), words.title.lower()), folds),
+        + folded(more(len(others), len(entries) - len(shown), words.frame), folds),
     )
 
 
@@ -226,7 +226,7 @@ def frame_by_frame(source: Source) -> str:
     intro = (
         "How far the body moves while the shutter is open."
         if region is None
-        else f"{words_of(source.metrics).frames.capitalize()}. The faster the person, the more of "
+        else f"{begun(words_of(source.metrics).frame)}s. The faster the person, the more of "
         "a frame is smeared: a picture of the camera falls with the speed, a reconstruction should "
         "not."
     )

@@ -34,6 +34,7 @@ from evsplat.pages import (
 from evsplat.pictures import to_bytes
 from evsplat.pictures.colours import css_gradient
 from evsplat.spread import evenly_spread
+from evsplat.wording import counted
 
 _PAIRS_OPEN = {"test": 4, "train": 2}
 """Event map pairs shown at once per split; the others are folded."""
@@ -173,7 +174,7 @@ def _event_maps(source: Source) -> str:
         f"{': ' if means else ''}{means}.",
         legend(css_gradient(signed=True), "darker", "brighter", "events")
         + _event_pairs(source, shown, embed)
-        + folded(more(len(others), len(rest), "pairs"), _event_pairs(source, others, embed)),
+        + folded(more(len(others), len(rest), "pair"), _event_pairs(source, others, embed)),
     )
 
 
@@ -226,8 +227,8 @@ def _novel_views(source: Source) -> str:
         if not pairs:
             continue
         blocks.append(
-            f"<h3>{escape(name)} <small>mean of {len(drawn)} views{frame_figures(values)}"
-            f'</small></h3><div class="pairs">{"".join(pairs)}</div>'
+            f"<h3>{escape(name)} <small>mean of {counted(len(drawn), 'view')}"
+            f'{frame_figures(values)}</small></h3><div class="pairs">{"".join(pairs)}</div>'
         )
     if not blocks:
         return ""
