@@ -1,6 +1,7 @@
 """Configuration: round trips and errors that help."""
 
 import math
+import re
 import time
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -136,6 +137,17 @@ def test_malformed_overrides_are_refused(text):
 def test_a_key_that_is_set_twice_is_refused():
     with pytest.raises(ConfigError, match=r"--set flag=true: flag is given twice; leave one out\."):
         override(to_dict(Outer()), ["flag=false", "inner.rate=1", "flag=true"])
+
+
+@pytest.mark.parametrize("section", ["inner={rate: 2.0}", "inner={}", "inner=null"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_section_and_a_key_of_it_are_not_both_set(section, turned):
+    first, last = ("inner.rate=1", section) if turned else (section, "inner.rate=1")
+    message = f"--set {last}: --set {first}, which is given before it, says some of the same"
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        override(to_dict(Outer()), ["flag=true", first, last])
+    # a name that only begins alike is another's
+    assert override({}, ["a=1", "ab.c=2", "a_b=3"]) == {"a": 1, "ab": {"c": 2}, "a_b": 3}
 
 
 def test_unknown_method_names_the_nearest():

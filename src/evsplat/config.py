@@ -166,9 +166,9 @@ def load_yaml(path: Path | str) -> dict[str, Any]:
 def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, Any]:
     """Apply ``section.key=value`` assignments (values in YAML) to nested dictionaries.
 
-    A `ConfigError` where one is malformed, or a key is given twice.
+    A `ConfigError` where one is malformed, or a key is given twice, or a section and a key in it.
     """
-    given: set[str] = set()
+    given: dict[str, str] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         printable = assignment.isprintable() and len(assignment) <= _LONGEST_NAME
@@ -177,7 +177,13 @@ def override(values: dict[str, Any], assignments: Sequence[str]) -> dict[str, An
             raise ConfigError(f"--set {shown}: expected KEY=VALUE, such as --set event_start=1000.")
         if key in given:
             raise ConfigError(f"--set {shown}: {brief(key)[1:-1]} is given twice; leave one out.")
-        given.add(key)
+        for other, said in given.items():
+            if key.startswith(f"{other}.") or other.startswith(f"{key}."):
+                raise ConfigError(
+                    f"--set {shown}: --set {said}, which is given before it, says some of the same "
+                    "settings; write both as one, or leave one out."
+                )
+        given[key] = shown
         try:
             value = parse_yaml(text)
         except ValueError:
