@@ -46,6 +46,19 @@ def test_missing_capture_is_one_message_and_code_2(capsys, tmp_path, verb):
         ("train c --set=A=1 --seed 3 --set B=2", "train c --set A=1 B=2 --seed 3"),
         ("bench s --only a --seeds 1 --only b", "bench s --only a b --seeds 1"),
         ("bench s --seeds 1 -2 --jobs 1", "bench s --seeds 1 -2 --jobs 1"),
+        ("bench s --captures a --captures b --add x=y", "bench s --captures a b --add x=y"),
+        ("bench s --add x=y --jobs 1 --add u=v", "bench s --add x=y u=v --jobs 1"),
+        (
+            "simulate v --set shot_hz=2 --out e.h5 --set leak_hz=1",
+            "simulate v --set shot_hz=2 leak_hz=1 --out e.h5",
+        ),
+        (
+            "import zju-mocap s --novel-cameras 1 --out o --novel-cameras 2",
+            "import zju-mocap s --novel-cameras 1 2 --out o",
+        ),
+        ("convert a b --columns x,y --columns t", "convert a b --columns x,y --columns t"),
+        ("import", "import"),
+        ("--set A=1 --set B=2", "--set A=1 --set B=2"),
     ],
 )
 def test_settings_given_one_by_one_all_count(given, meant):

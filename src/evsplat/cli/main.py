@@ -5,6 +5,7 @@ import io
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import is_dataclass
 from difflib import get_close_matches
 from typing import Any
 
@@ -17,7 +18,7 @@ from evsplat.cli.exits import end_quietly, exit_code
 from evsplat.cli.import_ import check_kind, import_, import_with_kinds
 from evsplat.errors import ConfigError
 from evsplat.options.inputs import check_inputs
-from evsplat.options.reading import IN_ORDER
+from evsplat.options.reading import IN_ORDER, lists_of
 
 _VERBS: dict[str, Callable[..., Any]] = {
     "demo": runs.demo,
@@ -41,7 +42,6 @@ _VERBS: dict[str, Callable[..., Any]] = {
     "bench": runs.Bench,
 }
 """A function works as it is called; an object is called for its work."""
-_LISTS_OF_BENCH = ("--captures", "--add", "--seeds", "--only")
 _DESCRIPTION = (
     "A sharp 3D Gaussian person in a scene, from a blurry video and events.\n\n"
     "Start with 'evsplat demo'; 'evsplat VERB --help' tells more."
@@ -104,9 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _gathered(arguments: Sequence[str]) -> list[str]:
     """``--set A=1 --set B=2`` as ``--set A=1 B=2``: the parser would keep the last one alone.
 
-    So with the lists of ``bench``, and with ``--set=A=1``.
+    So with all options of the verb that take several values, and with ``--set=A=1``.
     """
-    lists = {"--set", *(_LISTS_OF_BENCH if "bench" in arguments[:1] else ())}
+    lists = _lists(arguments)
     kept: list[list[str]] = []
     gathered: dict[str, list[str]] = {}
     last: list[str] | None = None
@@ -124,6 +124,15 @@ def _gathered(arguments: Sequence[str]) -> list[str]:
             last = None
             kept.append([argument])
     return [word for words in kept for word in words]
+
+
+def _lists(arguments: Sequence[str]) -> set[str]:
+    verb: Any = _VERBS.get(arguments[0]) if arguments else None
+    if arguments[:1] == ["import"]:
+        from evsplat.importers import KINDS
+
+        verb = KINDS.get("".join(arguments[1:2]))
+    return lists_of(verb) if isinstance(verb, type) and is_dataclass(verb) else set()
 
 
 def _in_a_line(verb: Callable[..., Any]) -> Callable[[], None]:

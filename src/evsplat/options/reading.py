@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
-from typing import Annotated, Any, Generic, get_args, get_type_hints
+from typing import Annotated, Any, Generic, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import (
@@ -34,6 +34,28 @@ def _in_order(info: StructTypeInfo) -> StructConstructorSpec | None:
     return StructConstructorSpec(make, tuple(_options(info.type)))
 
 
+def lists_of(kind: type[Any]) -> set[str]:
+    """Options of a verb, such as "--set", that take any number of values."""
+    return {
+        f"--{_name(field.type) or field.name.replace('_', '-')}"
+        for field in _options(kind)
+        if get_origin(value := _bare(field.type)) is tuple and get_args(value)[-1] is Ellipsis
+    }
+
+
+def _name(hint: Any) -> str | None:
+    """What an option is called where that is not its field's name."""
+    return next(filter(None, (getattr(one, "name", None) for one in _marks(hint))), None)
+
+
+def _bare(hint: Any) -> Any:
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
+def _marks(hint: Any) -> tuple[Any, ...]:
+    return getattr(hint, "__metadata__", ())
+
+
 def _options(kind: type[Any]) -> Iterator[StructFieldSpec]:
     docs, hints = field_docs(kind), get_type_hints(kind, include_extras=True)
     for field in sorted(fields(kind), key=lambda field: _has(hints[field.name], LAST)):
@@ -59,12 +81,12 @@ def _flat_part(hint: Any) -> type[Any] | None:
 
 
 def _has(hint: Any, mark: Any) -> bool:
-    return any(one is mark for one in getattr(hint, "__metadata__", ()))
+    return any(one is mark for one in _marks(hint))
 
 
 def _read_type(hint: Any) -> Any:
     """The hint, or what its option is to be read as in place of it."""
-    marks = getattr(hint, "__metadata__", ())
+    marks = _marks(hint)
     for mark in marks:
         if (read_as := getattr(mark, "constructor_factory", None)) is not None:
             return Annotated[(read_as(), *marks)]
