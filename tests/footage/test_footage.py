@@ -1,7 +1,9 @@
 """Videos and folders of pictures: what was put in comes out, with its times."""
 
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -11,6 +13,7 @@ from PIL import Image
 from evsplat.errors import ConfigError, DataError
 from evsplat.footage import open_footage
 from evsplat.untrusted.pictures import image_size
+from evsplat.untrusted.videos import opened_video
 
 
 def write_video(path: Path, pictures: np.ndarray, stamps: list[int], rate: int = 1000) -> None:
@@ -58,6 +61,33 @@ def test_a_bare_stream_is_told_what_it_wants(tmp_path):
         DataError, match="clip.h264: is no video with times.* expected MP4.*ffmpeg -framerate"
     ):
         open_footage(tmp_path / "clip.h264")
+
+
+@pytest.mark.parametrize("without", [{3}, set(range(6))])
+def test_pictures_without_times_ask_for_a_rate(tmp_path, monkeypatch, without):
+    pictures = some_pictures(6)
+    write_video(tmp_path / "clip.mkv", pictures, [0, 40, 80, 120, 160, 200])
+
+    @contextmanager
+    def timeless(path):
+        def demux(stream):
+            for number, packet in enumerate(container.demux(stream)):
+                if number in without:
+                    packet.pts = packet.dts = None
+                yield packet
+
+        with opened_video(path) as (container, stream):
+            yield SimpleNamespace(demux=demux, decode=container.decode), stream
+
+    monkeypatch.setattr("evsplat.footage.video.opened_video", timeless)
+    message = (
+        rf"clip\.mkv: holds no time of {len(without)} of 6 pictures; give the rate .*with fps="
+    )
+    with pytest.raises(DataError, match=message):
+        open_footage(tmp_path / "clip.mkv", rate_option="fps=")
+    footage = open_footage(tmp_path / "clip.mkv", fps=25, rate_option="fps=")
+    assert footage.times_us.tolist() == [0, 40_000, 80_000, 120_000, 160_000, 200_000]
+    assert np.array_equal([picture.pixels for picture in footage], pictures)
 
 
 def test_sixteen_bit_grey_video_keeps_its_depth(tmp_path):

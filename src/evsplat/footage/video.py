@@ -9,6 +9,7 @@ import numpy as np
 from evsplat.errors import DataError
 from evsplat.footage.pictures import TimedPicture, times_of_rate
 from evsplat.untrusted.videos import opened_video
+from evsplat.wording import counted
 
 # Transfer characteristics of ITU-T H.273: PQ and HLG code light in ways no other part understands.
 _HDR_TRANSFERS = {16: "PQ", 18: "HLG"}
@@ -46,6 +47,11 @@ class VideoFootage:
         if fps is not None:
             self.times_us = times_of_rate(len(stamps), fps)
             return
+        if lacking := int(np.isnan(stamps).sum()):
+            raise DataError(
+                f"{path}: holds no time of {lacking} of {counted(len(stamps), 'picture')}; give "
+                f"the rate at which they were taken with {rate_option}."
+            )
         self.times_us = np.round((stamps - stamps[0]) * 1e6).astype(np.int64)
         if (np.diff(self.times_us) <= 0).any():
             at = int(np.argmax(np.diff(self.times_us) <= 0)) + 1
@@ -67,12 +73,12 @@ class VideoFootage:
             )
 
     def _timestamps(self) -> np.ndarray:
-        """Seconds of all pictures, ascending, without decoding them."""
+        """Seconds of all pictures, ascending, not decoded; NaN where the file has none."""
         with opened_video(self.path) as (container, stream):
             stamps = [
                 packet.pts
                 for packet in container.demux(stream)
-                if packet.pts is not None and not packet.is_discard
+                if packet.size and not packet.is_discard  # the last one is empty
             ]
             return np.sort(np.array(stamps, dtype=np.float64)) * float(stream.time_base)
 
