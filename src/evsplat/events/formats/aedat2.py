@@ -97,8 +97,10 @@ class Aedat2(Source):
             while True:
                 self._start = reader.offset
                 line = reader.read_line(_MAX_LINE_BYTES)
-                # an address may begin with the byte # too; what follows has control characters
-                is_text = line.endswith(b"\n") and not _CONTROL.search(line.rstrip(b"\r\n"))
+                # An address may begin with the byte # too. What follows has control characters, or
+                # a line's end comes at once, but then not that of the lines before.
+                end = b"\r\n" if lines and lines[0].endswith(b"\r\n") else b"\n"
+                is_text = line.endswith(end) and not _CONTROL.search(line.rstrip(b"\r\n"))
                 if not line.startswith(b"#") or not is_text:
                     return b"".join(lines).decode("latin-1")
                 lines.append(line)
