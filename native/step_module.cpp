@@ -1,6 +1,7 @@
 // Python bindings of what a training step computes between networks, rasteriser and losses.
 
 #include "bindings.h"
+#include "finite.h"
 #include "isometry.h"
 #include "picture.h"
 #include "posing.h"
@@ -14,6 +15,13 @@ namespace {
 using Rows = Strided;  // (T, N, columns): columns together, rows evenly apart
 using Index = Array<const int64_t>;
 using Bits = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+
+double py_sum_of_magnitudes(const std::vector<In>& arrays, int threads) {
+    std::vector<Values> values;
+    for (const In& array : arrays) values.push_back({array.data(), array.size()});
+    nb::gil_scoped_release release;
+    return sum_of_magnitudes(values, threads);
+}
 
 double py_membership(In share, Bits bits, float lowest, std::optional<Out> slope, int threads) {
     const size_t count = share.size(), bytes = (count + 7) / 8;
@@ -306,6 +314,8 @@ void evsplat::bind_step(nb::module_& m) {
     m.def("misfit", &py_misfit, nb::arg("colours"), nb::arg("ends"), nb::arg("image"), nb::arg("weight"), nb::arg("scale"),
           nb::arg("slope").none(), nb::arg("sums"), nb::arg("threads"),
           "How far colours are from those of pictures: sums of each, and the slopes.");
+    m.def("sum_of_magnitudes", &py_sum_of_magnitudes, nb::arg("arrays"), nb::arg("threads"),
+          "The sum of the magnitudes of all values, NaN or infinite if one of them is: arrays of any shape.");
     m.def("membership", &py_membership, nb::arg("share"), nb::arg("bits"), nb::arg("lowest"), nb::arg("slope").none(),
           nb::arg("threads"), "Sum of the logarithms of what pixels surely are, by two bit masks, and its slope.");
     m.def("map_difference", &py_map_difference, nb::arg("map"), nb::arg("reference"), nb::arg("floor"),

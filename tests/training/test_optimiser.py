@@ -115,3 +115,42 @@ def test_rates_for_the_log_are_those_of_the_attributes():
     expected = {name: 0.1 * rate for name, rate in STARTS.items()}
     expected["semantic_logits"] = STARTS["semantic_logits"]
     assert made.optimiser.learning_rates() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("wrong", [float("nan"), float("inf"), -float("inf")])
+def test_one_value_anywhere_that_is_not_finite_is_found(monkeypatch, seed, compiled, wrong):
+    """In the first piece or the last, in a vector or in what is left over, in `others` as well."""
+    if not compiled:
+        monkeypatch.setattr("evsplat.training.optimiser.runs_native", lambda tensor: False)
+    made, generator = Made(), torch.Generator().manual_seed(seed)
+    long = torch.nn.Parameter(torch.zeros(2 * 2**15 + 21))  # of three pieces, the last a short one
+    made.optimiser.networks.param_groups[0]["params"].append(long)
+    gradients = [*made.parameters().values(), long]
+    for value in gradients:
+        value.grad = torch.randn(value.shape, generator=generator)
+    loss = torch.randn((), generator=generator)
+    assert bool(made.optimiser.finite(loss))
+    assert not bool(made.optimiser.finite(loss * wrong))
+    for value in gradients:
+        last = value.numel() - 1
+        drawn = int(torch.randint(value.numel(), (), generator=generator))
+        for place in {0, min(2**15, last), drawn, last}:
+            flat = value.grad.view(-1)
+            kept = flat[place].clone()
+            flat[place] = wrong
+            assert not bool(made.optimiser.finite(loss)), (tuple(value.shape), place)
+            flat[place] = kept
+    assert bool(made.optimiser.finite(loss))
+
+
+def test_a_gradient_of_any_layout_is_looked_at_whole():
+    made = Made()
+    for value in made.parameters().values():
+        value.grad = torch.ones_like(value)
+    weight = made.networks[1].weight
+    weight.grad = torch.ones(2, 4).T
+    assert bool(made.optimiser.finite())
+    weight.grad[3, 1] = torch.nan
+    assert not bool(made.optimiser.finite())

@@ -6,9 +6,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from evsplat.compiled import native, runs_native
 from evsplat.gaussians import Adam, RowAdam, step_together
 from evsplat.methods.learning import Learning
 from evsplat.models.model import Model
+
+_LARGEST = torch.finfo(torch.float32).max
 
 
 class Optimiser:
@@ -95,7 +98,12 @@ class Optimiser:
             if p.grad is not None
         ]
         # A sum is NaN or infinite exactly if an entry is (or it overflows, which is as bad).
-        return (torch.stack(torch._foreach_norm([*others, *gradients], 1)) < torch.inf).all()
+        values = [*others, *gradients]
+        if all(map(runs_native, values)):
+            arrays = [value.contiguous() for value in values]
+            total = native.sum_of_magnitudes(arrays, torch.get_num_threads())
+            return torch.tensor(total < _LARGEST)
+        return (torch.stack(torch._foreach_norm(values, 1)) < torch.inf).all()
 
     def state(self) -> dict[str, Tensor]:
         """Moments and step counts, named by group and parameter number."""
