@@ -161,9 +161,12 @@ struct GaussianGrads {
     KERNEL(void, shadow_on_body_backward, (const ShadowLook&, size_t begin, size_t end, const float* above, float* grid, float* sums)) \
     KERNEL(void, sensor_step, (const SensorPiece&))
 
+struct TileKernels;
+
 struct Kernels {
     const char* name;
     int lanes, patches;
+    const TileKernels* tiles;  // networks on AMX, in place of the two of networks below; null without
     void (*forward)(const ForwardJob&, const TileWork&);
     // Writes the entries' slots; with `add` those of Gaussians that stand still are added to.
     void (*backward)(const BackwardJob&, const TileWork&, bool add);

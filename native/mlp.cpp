@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <stdexcept>
+#include <utility>
 
 #include "levels.h"
 #include "thread_pool.h"
@@ -106,7 +107,59 @@ static MlpForward pack_weights(const MlpInputs& in, const MlpShape& s, Buffer<fl
     return job;
 }
 
+// The weights as AMX takes them, behind them the biases.
+static TileJob pack_tiles(const MlpInputs& in, const MlpShape& s, const TileKernels& kernels, Buffer<uint16_t>& tiles,
+                          Buffer<float>& biases) {
+    const auto values = [](int out, int in) {
+        const size_t forward = size_t(tile_panels(out)) * tile_steps(in);
+        return 2 * kTileValues * (forward + size_t(tile_panels(in)) * tile_steps(out));
+    };
+    size_t count = values(s.width, s.per_point) + values(s.width, s.per_both);
+    size_t floats = s.times * s.width_panels * s.lanes;
+    for (int l = 0; l < s.layers; ++l)
+        count += values(s.columns(l), s.width), floats += size_t(s.panels(l)) * s.lanes;
+    tiles.reset(count), biases.reset(floats);
+
+    uint16_t* to = tiles.data();
+    const auto pack = [&](const float* weight, int out, int in) {
+        TileWeight packed = {to, nullptr, nullptr};
+        kernels.pack_weight(weight, in, out, 1, in, to);
+        to += 2 * kTileValues * tile_panels(out) * tile_steps(in);
+        packed.backward = to;
+        kernels.pack_weight(weight, out, in, in, 1, to);
+        to += 2 * kTileValues * tile_panels(in) * tile_steps(out);
+        return packed;
+    };
+    float* bias = biases.data();
+    const auto pad = [&](const float* from, int columns) {
+        to_panels(from, 1, columns, 0, 1, s.lanes, bias);
+        return std::exchange(bias, bias + size_t(panels_of(columns, s.lanes)) * s.lanes);
+    };
+    TileJob job = {};
+    job.points = s.points, job.times = s.times, job.layers = s.layers;
+    job.per_point = s.per_point, job.per_both = s.per_both, job.width = s.width, job.out = s.out;
+    job.slope = s.slope, job.point = in.point, job.both = in.both;
+    job.point_weight = pack(in.point_weight, s.width, s.per_point);
+    job.both_weight = pack(in.both_weight, s.width, s.per_both);
+    for (int l = 0; l < s.layers; ++l) {
+        job.layer[l] = pack(in.weights[l], s.columns(l), s.width);
+        job.layer[l].bias = pad(in.biases[l], s.columns(l));
+    }
+    job.bias = bias;
+    for (size_t t = 0; t < s.times; ++t) pad(in.bias + t * s.width, s.width);
+    return job;
+}
+
 void Mlp::forward(float* output) {
+    if (kernels_.tiles) {
+        tile_job_ = pack_tiles(in_, shape_, *kernels_.tiles, tiles_, packed_);
+        const size_t blocks = (in_.points + kTileBlock - 1) / kTileBlock;
+        parallel_for(threads_, blocks, [&](size_t block) {
+            Buffer<uint8_t> scratch(tile_scratch(tile_job_));
+            kernels_.tiles->forward(tile_job_, block, scratch.data(), output);
+        });
+        return;
+    }
     job_ = pack_weights(in_, shape_, packed_);
     if (shape_.keep) activations_.reset(shape_.blocks * shape_.times * shape_.kept());
     job_.activations = activations_.data(), job_.output = output;
@@ -120,19 +173,26 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
     const MlpShape& s = shape_;
     if (!s.keep) throw std::runtime_error("backward of an MLP that kept nothing");
     const MlpBackward job = {job_, output_grad, grads.point, grads.both};
+    const TileBackward tile_job = {output_grad, grads.point, grads.both};
 
-    const size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / kBlocksPerGroup));
+    const size_t blocks = kernels_.tiles ? (in_.points + kTileBlock - 1) / kTileBlock : s.blocks;
+    // As many points a group as on AMX, whose blocks are twice as large.
+    const size_t per_group = kernels_.tiles ? kBlocksPerGroup / 2 : kBlocksPerGroup;
+    const size_t groups = std::max<size_t>(1, std::min(kMostGroups, blocks / per_group));
     Pieces counted;
     sums_in(s, counted);
     const size_t floats = counted.taken;
     Buffer<float> sums(groups * floats);
     parallel_for(threads_, groups, [&](size_t group) {
-        Buffer<float> scratch(mlp_scratch(s));
+        Buffer<float> scratch(kernels_.tiles ? tile_scratch(tile_job_) / sizeof(float) : mlp_scratch(s));
         Pieces mine{sums.data() + group * floats};
         std::fill_n(mine.buffer, floats, 0.f);
         const MlpSums parts = sums_in(s, mine);
-        for (size_t block = s.blocks * group / groups; block < s.blocks * (group + 1) / groups; ++block)
-            kernels_.mlp_backward(s, job, block, parts, scratch.data());
+        for (size_t block = blocks * group / groups; block < blocks * (group + 1) / groups; ++block)
+            if (kernels_.tiles)
+                kernels_.tiles->backward(tile_job_, tile_job, block, parts, reinterpret_cast<uint8_t*>(scratch.data()));
+            else
+                kernels_.mlp_backward(s, job, block, parts, scratch.data());
     });
     // Pieces of the vector of sums, each over the groups in order.
     in_pieces(threads_, floats, 4096, [&](size_t begin, size_t end) {

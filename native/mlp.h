@@ -8,6 +8,7 @@
 
 #include "buffer.h"
 #include "kernels.h"
+#include "tile_mlp_kernels.h"
 
 namespace evsplat {
 
@@ -32,7 +33,7 @@ struct MlpGrads {
 // One evaluation. Sums are in an order that does not depend on the number of threads.
 class Mlp {
   public:
-    // `keep` stores what `backward` needs.
+    // `keep` stores what `backward` needs. On AMX nothing is stored, `backward` makes it anew.
     Mlp(const MlpInputs& inputs, bool keep, int threads);
     void forward(float* output);
     void backward(const float* output_grad, const MlpGrads& grads);
@@ -44,6 +45,8 @@ class Mlp {
     MlpShape shape_;
     Buffer<float> packed_, activations_;
     MlpForward job_ = {};  // points into the buffers
+    Buffer<uint16_t> tiles_;
+    TileJob tile_job_ = {};  // the same on AMX
 };
 
 }  // namespace evsplat
