@@ -367,8 +367,7 @@ double multiply_add(int64_t rounds, float* sink) {
 }  // namespace
 
 #define EVSPLAT_ENTRY(result, name, arguments) name,
-const Kernels kernels = {EVSPLAT_NAME, W,        kPatches,     nullptr,
-                         forward,      backward, multiply_add, EVSPLAT_KERNELS(EVSPLAT_ENTRY)};
+const Kernels kernels = {EVSPLAT_NAME, W, kPatches, forward, backward, multiply_add, EVSPLAT_KERNELS(EVSPLAT_ENTRY)};
 
 }  // namespace EVSPLAT_LEVEL
 }  // namespace evsplat

@@ -166,7 +166,6 @@ struct TileKernels;
 struct Kernels {
     const char* name;
     int lanes, patches;
-    const TileKernels* tiles;  // networks on AMX, in place of the two of networks below; null without
     void (*forward)(const ForwardJob&, const TileWork&);
     // Writes the entries' slots; with `add` those of Gaussians that stand still are added to.
     void (*backward)(const BackwardJob&, const TileWork&, bool add);
@@ -174,6 +173,7 @@ struct Kernels {
     double (*multiply_add)(int64_t rounds, float* sink);
 #define EVSPLAT_POINTER(result, name, arguments) result(*name) arguments;
     EVSPLAT_KERNELS(EVSPLAT_POINTER)
+    const TileKernels* tiles = nullptr;  // networks on AMX, in place of the two above; null without
 };
 
 #define EVSPLAT_FUNCTION(result, name, arguments) result name arguments;

@@ -15,14 +15,12 @@
 namespace evsplat {
 
 #ifdef EVSPLAT_AMX
-// AMX and AVX-512's conversions to bfloat16, of the processor and, since tiles are eight kilobytes of state that a
-// process must ask for, of the kernel.
+// Of the processor and, since tiles are eight kilobytes of state that a process must ask for, of the kernel.
 static bool has_amx() {
-    constexpr unsigned kBf16 = 1u << 22, kTiles = 1u << 24, kConversions = 1u << 5;
+    constexpr unsigned kBf16 = 1u << 22, kTiles = 1u << 24;
     constexpr long kAskForState = 0x1023, kTileData = 18;  // ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA
     unsigned a, b, c, d;
     if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (d & (kBf16 | kTiles)) != (kBf16 | kTiles)) return false;
-    if (!__get_cpuid_count(7, 1, &a, &b, &c, &d) || !(a & kConversions)) return false;
     return syscall(SYS_arch_prctl, kAskForState, kTileData) == 0;
 }
 

@@ -78,7 +78,8 @@ Mlp::Mlp(const MlpInputs& inputs, bool keep, int threads)
     : in_(inputs), threads_(threads), kernels_(select_kernels()), shape_() {
     if (in_.weights.size() > kMlpLayers) throw std::runtime_error("an MLP of more than 16 layers");
     MlpShape& s = shape_;
-    s.points = in_.points, s.times = in_.times, s.blocks = (in_.points + kMlpRows - 1) / kMlpRows;
+    const size_t rows = kernels_.tiles ? kTileBlock : kMlpRows;
+    s.points = in_.points, s.times = in_.times, s.blocks = (in_.points + rows - 1) / rows;
     s.lanes = kernels_.lanes, s.layers = int(in_.weights.size());
     s.per_point = in_.per_point, s.per_both = in_.both ? in_.per_both : 0;
     s.width = in_.width, s.out = in_.out;
@@ -135,10 +136,8 @@ static TileJob pack_tiles(const MlpInputs& in, const MlpShape& s, const TileKern
         to_panels(from, 1, columns, 0, 1, s.lanes, bias);
         return std::exchange(bias, bias + size_t(panels_of(columns, s.lanes)) * s.lanes);
     };
-    TileJob job = {};
-    job.points = s.points, job.times = s.times, job.layers = s.layers;
-    job.per_point = s.per_point, job.per_both = s.per_both, job.width = s.width, job.out = s.out;
-    job.slope = s.slope, job.point = in.point, job.both = in.both;
+    TileJob job = {s};
+    job.point = in.point, job.both = in.both;
     job.point_weight = pack(in.point_weight, s.width, s.per_point);
     job.both_weight = pack(in.both_weight, s.width, s.per_both);
     for (int l = 0; l < s.layers; ++l) {
@@ -153,8 +152,7 @@ static TileJob pack_tiles(const MlpInputs& in, const MlpShape& s, const TileKern
 void Mlp::forward(float* output) {
     if (kernels_.tiles) {
         tile_job_ = pack_tiles(in_, shape_, *kernels_.tiles, tiles_, packed_);
-        const size_t blocks = (in_.points + kTileBlock - 1) / kTileBlock;
-        parallel_for(threads_, blocks, [&](size_t block) {
+        parallel_for(threads_, shape_.blocks, [&](size_t block) {
             Buffer<uint8_t> scratch(tile_scratch(tile_job_));
             kernels_.tiles->forward(tile_job_, block, scratch.data(), output);
         });
@@ -173,12 +171,10 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
     const MlpShape& s = shape_;
     if (!s.keep) throw std::runtime_error("backward of an MLP that kept nothing");
     const MlpBackward job = {job_, output_grad, grads.point, grads.both};
-    const TileBackward tile_job = {output_grad, grads.point, grads.both};
 
-    const size_t blocks = kernels_.tiles ? (in_.points + kTileBlock - 1) / kTileBlock : s.blocks;
-    // As many points a group as on AMX, whose blocks are twice as large.
+    // On AMX as many points a group, since blocks are twice as large.
     const size_t per_group = kernels_.tiles ? kBlocksPerGroup / 2 : kBlocksPerGroup;
-    const size_t groups = std::max<size_t>(1, std::min(kMostGroups, blocks / per_group));
+    const size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / per_group));
     Pieces counted;
     sums_in(s, counted);
     const size_t floats = counted.taken;
@@ -188,9 +184,9 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
         Pieces mine{sums.data() + group * floats};
         std::fill_n(mine.buffer, floats, 0.f);
         const MlpSums parts = sums_in(s, mine);
-        for (size_t block = blocks * group / groups; block < blocks * (group + 1) / groups; ++block)
+        for (size_t block = s.blocks * group / groups; block < s.blocks * (group + 1) / groups; ++block)
             if (kernels_.tiles)
-                kernels_.tiles->backward(tile_job_, tile_job, block, parts, reinterpret_cast<uint8_t*>(scratch.data()));
+                kernels_.tiles->backward(tile_job_, job, block, parts, reinterpret_cast<uint8_t*>(scratch.data()));
             else
                 kernels_.mlp_backward(s, job, block, parts, scratch.data());
     });

@@ -451,7 +451,7 @@ INLINE void add_rows(float* sums, At at) {
     _mm512_storeu_ps(sums, _mm512_add_ps(_mm512_loadu_ps(sums), total));
 }
 
-void backward(const TileJob& j, const TileBackward& wanted, size_t block, const MlpSums& sums, uint8_t* memory) {
+void backward(const TileJob& j, const MlpBackward& wanted, size_t block, const MlpSums& sums, uint8_t* memory) {
     const Tiles tiles;
     Scratch scratch = {memory};
     // What the way forward left is made anew: that takes a third of the time of writing and reading it.

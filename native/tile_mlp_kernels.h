@@ -1,4 +1,4 @@
-// The plain data that tile_mlp.cpp and its kernels exchange: networks on AMX, whose registers are tiles of 16 rows.
+// The plain data that mlp.cpp and the kernels of AMX exchange, whose registers are tiles of 16 rows.
 //
 // AMX multiplies bfloat16, which has 8 binary digits. So each float is the sum of two of them, `high` and `low`
 // together 16 digits, and a product of floats is three products: high high + high low + low high, summed in float32.
@@ -30,21 +30,10 @@ struct TileWeight {
     const float* bias;  // padded to whole panels
 };
 
-struct TileJob {
-    size_t points, times;
-    int layers, per_point, per_both, width, out;
-    float slope;
+struct TileJob : MlpShape {
     const float *point, *both;
     TileWeight point_weight, both_weight, layer[kMlpLayers];
     const float* bias;  // (times, width panels, 16), of the first layer
-
-    int columns(int layer) const { return layer + 1 < layers ? width : out; }
-};
-
-// What a block's way back starts from and what is wanted of it beside the sums.
-struct TileBackward {
-    const float* output_grad;      // (times, points, out)
-    float *point_grad, *both_grad; // may be null
 };
 
 // Bytes of scratch that a block needs.
@@ -59,7 +48,8 @@ inline size_t tile_scratch(const TileJob& j) {
 
 struct TileKernels {
     void (*forward)(const TileJob&, size_t block, uint8_t* scratch, float* output);
-    void (*backward)(const TileJob&, const TileBackward&, size_t block, const MlpSums&, uint8_t* scratch);
+    // Of the second argument what is above and what is wanted beside the sums.
+    void (*backward)(const TileJob&, const MlpBackward&, size_t block, const MlpSums&, uint8_t* scratch);
     // The right side of a product: row k, column n of it is weight[k * k_step + n * n_step].
     void (*pack_weight)(const float* weight, int rows, int columns, size_t k_step, size_t n_step, uint16_t* to);
 };
