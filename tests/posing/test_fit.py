@@ -83,6 +83,28 @@ def test_smpl_s_skeleton_is_fitted_as_well():
     assert off.norm(dim=-1).mean() < 3
 
 
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_of_somebody_who_lies_landmarks_count_as_of_somebody_upright(rng, turns):
+    """Before a camera on its side the same is seen, turned: its fit is the same one."""
+    upright = landmarks()
+    erring = upright.places + rng.normal(0, 2, upright.places.shape)
+    upright = replace(upright, places=erring, sigma_px=0 * upright.sigma_px)
+    expected = _fit(upright, flips=False)
+    tall = np.median(np.ptp(upright.places[..., 1], axis=1))
+    sigma = expected.problem.evidence.sigma_px
+    np.testing.assert_allclose(sigma, 0.012 * tall, rtol=0.03)
+
+    onto_side = np.linalg.matrix_power([[0, -1, 0], [1, 0, 0], [0, 0, 1]], turns)
+    world_to_camera = CAMERA.world_to_camera.clone()
+    world_to_camera[:3] = torch.tensor(onto_side, dtype=torch.float32) @ world_to_camera[:3]
+    places = (upright.places - 128) @ onto_side[:2, :2].T + 128
+    assert upright.world is not None
+    lying = replace(upright, places=places, world=upright.world @ onto_side.T)
+    found = _fit(lying, replace(CAMERA, world_to_camera=world_to_camera), flips=False)
+    torch.testing.assert_close(found.problem.evidence.sigma_px, sigma)
+    torch.testing.assert_close(found.joints(TIMES), expected.joints(TIMES), rtol=0, atol=2e-3)
+
+
 def test_errors_grow_with_those_of_the_landmarks():
     marks = landmarks(noise_px=1.0)
     sure = _fit(marks, flips=False).errors(TIMES)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from evsplat.body import BodyTrack
@@ -189,7 +189,7 @@ def make_evidence(landmarks: Landmarks, views: Views, attached: Attachments) -> 
     places = torch.from_numpy(np.asarray(landmarks.places, np.float64))
     said = torch.from_numpy(np.asarray(landmarks.sigma_px, np.float64))[:, index]
     seen = torch.from_numpy(np.asarray(landmarks.seen, np.float64))[:, index]
-    tall = _tall(places[:, index, 1], seen > 0)
+    tall = _tall(places[:, index], seen > 0)
     hips = [list(landmarks.names).index(f"{side}_hip") for side in ("left", "right")]
     depths = None
     if landmarks.world is not None:
@@ -207,12 +207,15 @@ def make_evidence(landmarks: Landmarks, views: Views, attached: Attachments) -> 
     )
 
 
-def _tall(rows: Float[Tensor, "T L"], seen: Tensor) -> float:
-    """Height of what is seen of the person, pixels: the median over the pictures."""
-    nan = torch.full_like(rows, math.nan)
-    high, low = (torch.where(seen, rows, sign * math.inf) for sign in (-1, 1))
-    spans = high.amax(1) - low.amin(1)
-    return float(torch.where(seen.any(1), spans, nan[:, 0]).nanmedian())
+def _tall(places: Float[Tensor, "T L 2"], seen: Bool[Tensor, "T L"]) -> float:
+    """Length of what is seen of the person, pixels: the median over the pictures.
+
+    Across rows, or columns where those are more: of somebody who lies, or before a camera on its
+    side, rows are how thick they are.
+    """
+    high, low = (torch.where(seen[..., None], places, sign * math.inf) for sign in (-1, 1))
+    spans = (high.amax(1) - low.amin(1))[seen.any(1)]
+    return float(spans.median(0).values.max()) if len(spans) else math.nan
 
 
 @dataclass(frozen=True, eq=False)
