@@ -11,6 +11,8 @@ from .clouds import covariances, random_cloud
 
 pytest.importorskip("viser", reason="needs the extra view")
 
+pytestmark = pytest.mark.filterwarnings("error::DeprecationWarning")
+
 
 def test_the_recording_becomes_one_page(run, monkeypatch, capfd):
     shown = []

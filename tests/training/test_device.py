@@ -16,6 +16,8 @@ from ..seen import seen
 from ..small_model import built
 from .foreign_device import NAME, NEEDS_DATA, ForeignDevice, Here, HostWaits, as_on_a_gpu
 
+pytestmark = pytest.mark.filterwarnings("error:Accessing the data pointer")
+
 # Its weights come with the extra `perceptual`.
 _WEIGHTS = importlib.util.find_spec("stlpips_pytorch")
 PERCEPTUAL = ("terms.perceptual=st_lpips",) if _WEIGHTS is not None else ()

@@ -49,7 +49,8 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
     with contextlib.redirect_stdout(io.StringIO()):  # viser's address, at which nobody looks
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
-        server.gui.configure_theme(control_layout="collapsible", dark_mode=True)
+        server.gui.configure_theme(dark_mode=True)
+        server.gui.main_panel.dock_right()
         server.scene.set_up_direction(tuple(up_axis(track).tolist()))
         view = middle.camera
         # The reader orbits about a place as far as the person.
