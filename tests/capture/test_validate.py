@@ -315,7 +315,7 @@ def test_unknown_key_names_the_nearest(
             "[0.1, 0.2]",
             "4, 5 or 8",
         ),
-        (("novel_views", 0, "frame"), "77", "novel_views[0].frame", "'77'", "valid frame"),
+        (("novel_views", 0, "frame"), "77", "novel_views[0].frame", "'77'", "of a frame"),
         (("novel_views", 0, "frame"), "0008", "novel_views[1].frame", "second view", "one view"),
         (("body", "model"), "star", "body.model", "'star'", "'rig'"),
         (
@@ -352,6 +352,13 @@ def test_unknown_key_names_the_nearest(
             for f in (1e-6, 1e9)
         ),
         (("cameras", "side", "width"), 20_000, "cameras.side.width", "20000", "at most 16384"),
+        *(
+            ((*keys, key), value, f"{field}.{key}", str(17 * 10**15), "up to 9.0072e+15")
+            for keys, field, key, value in (
+                (("frames", 3), "frames[3]", "exposure_us", [0, 17 * 10**15]),
+                (("novel_views", 0), "novel_views[0]", "time_us", 17 * 10**15),
+            )
+        ),
         (("frames", 9, "exposure_us"), [360_000, 10**9], "frames[9].exposure_us", "", "a minute"),
         (("events", "clock_offset_us"), 1.5, "events.clock_offset_us", "1.5", "whole number"),
         (("events", "simulated"), "yes", "events.simulated", "'yes'", "true or false"),
@@ -368,6 +375,16 @@ def test_fault_of_the_description(
     check(matching[0], path / "capture.json", field, found, expected)
     message = refuses_to_load(path)
     assert str(path / "capture.json") in message
+
+
+@pytest.mark.parametrize("camera", ["main", "side"])
+def test_fault_of_a_camera_is_told_once_not_for_all_its_frames_and_views(
+    tiny_capture: Factory, camera: str
+) -> None:
+    path = tiny_capture()
+    edit_json(path, "cameras", camera, "K", 0, 0, value=-1.0)
+    finding = the_only(path)
+    check(finding, path / "capture.json", f"cameras.{camera}.K", "-1.0", "fx and fy above 0")
 
 
 def test_mirrored_rotation(tiny_capture: Factory) -> None:
@@ -791,6 +808,31 @@ def test_index_must_reach_the_last_event_and_hold_beyond_it(tiny_capture: Factor
     edit_events(path, "ms_to_idx", lambda index: index[:50])
     finding = the_only(path)
     check(finding, path / "events.h5", "ms_to_idx", "50 milli", f"at least {last_ms + 1}, one")
+
+
+def test_times_since_1970_are_to_be_put_into_the_offset(tiny_capture: Factory) -> None:
+    """Rebuilding the index, as is right otherwise, would take hours and a disk of its own."""
+    path = tiny_capture()
+    edit_events(path, "events/t", lambda t: t + 1_700_000_000_000_000)
+    edit_events(path, "t_offset", lambda offset: offset - 1_700_000_000_000_000)
+    edit_events(path, "ms_to_idx", np.zeros_like)
+    finding = the_only(path)
+    check(finding, path / "events.h5", "ms_to_idx", "milliseconds", "at least 1700000000")
+    assert finding.remedy.startswith("Subtract 17000000000") and "t_offset" in finding.remedy
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_times_before_zero_are_no_fault(
+    tiny_capture: Factory, monkeypatch: pytest.MonkeyPatch, deep: bool
+) -> None:
+    monkeypatch.setattr("evsplat.capture.check_events._SHORT", 0)
+    path = tiny_capture()
+    edit_events(path, "events/t", lambda t: t - 1_000_000)
+    edit_events(path, "t_offset", lambda offset: offset + 1_000_000)
+    with h5py.File(path / "events.h5") as file:
+        count = len(file["events/t"])
+    edit_events(path, "ms_to_idx", lambda index: np.full(1, count, index.dtype))
+    assert validate_capture(path, deep=deep) == []
 
 
 def test_negative_polarity_is_not_brighter(tiny_capture: Factory) -> None:

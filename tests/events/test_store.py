@@ -116,6 +116,38 @@ def test_slices_equal_brute_force_on_any_clock(
     store.close()
 
 
+def write_with_its_own_times(path: Path, events: EventStream) -> None:
+    """As the documentation shows it for h5py, without an offset for what is before 0."""
+    milliseconds = np.arange(0, max(events.t[-1] // 1000 + 2, 1)) * 1000
+    with h5py.File(path, "w") as file:
+        for name, column in zip("txyp", (events.t, events.x, events.y, events.p > 0), strict=True):
+            file[f"events/{name}"] = column.astype({"t": "i8", "p": "u1"}.get(name, "u2"))
+        file["ms_to_idx"] = np.searchsorted(events.t, milliseconds).astype("u8")
+        file["t_offset"] = np.int64(0)
+
+
+@pytest.mark.parametrize("first_us", [-20_300, -90_000])
+def test_times_before_zero_are_found_though_the_index_begins_there(
+    rng: np.random.Generator, tmp_path: Path, first_us: int
+) -> None:
+    """Against brute force, of a recording that begins before 0, or is before it altogether."""
+    events = random_events(int(rng.integers(10_000)), 800, 60_000, first_us)
+    write_with_its_own_times(tmp_path / "events.h5", events)
+    hidden = (first_us + 7_200, first_us + 9_100)
+    readable = [(ALWAYS[0], hidden[0]), (hidden[1], ALWAYS[1])]
+    whole = EventStore(tmp_path / "events.h5", WIDTH, HEIGHT)
+    store = whole.restricted_to(readable)
+    for one in (whole, whole.keeping(1 << 20)):
+        for _ in range(30):
+            start, end = map(int, np.sort(rng.integers(first_us - 5_000, first_us + 70_000, 2)))
+            assert same(one.between(start, end), events.between(start, end))
+    assert len(store) == len(events) - len(events.between(*hidden))
+    edges, rate = whole.rate(13)
+    assert np.allclose(rate * np.diff(edges) / 1e6, np.histogram(events.t, bins=edges)[0])
+    spans = 1000 * np.sort(rng.integers(first_us // 1000, first_us // 1000 + 60, (20, 2)))
+    assert whole.counts(spans).tolist() == [len(events.between(*span)) for span in spans.tolist()]
+
+
 def test_times_stored_as_dsec_does_are_read(tmp_path: Path) -> None:
     """uint32 times from zero, the absolute start in t_offset."""
     events = random_events(1, 500, 20_000)

@@ -193,13 +193,15 @@ def _check_index(entry: EventsEntry, file: h5py.File, findings: Findings) -> Non
         return
     last_ms = int(t[-1]) // 1000
     if last_ms >= len(index):
-        _note_short_index(entry, len(index), last_ms + 1, findings)
+        _note_short_index(entry, file, last_ms + 1, findings)
         return
     if (wrong := _descent(index)) is not None:
         _note_wrong_index(entry, wrong, int(index[wrong]), findings)
         return
     first_ms = max(0, int(t[0]) // 1000)
-    asked = np.unique(np.linspace(first_ms, last_ms, _INDEX_SAMPLES).round())
+    # Of times below 0 the index has no entries.
+    samples = _INDEX_SAMPLES if last_ms >= 0 else 0
+    asked = np.unique(np.linspace(first_ms, last_ms, samples).round())
     for ms in map(int, asked):
         row, time = int(index[ms]), 1000 * ms
         found = 0 <= row <= count
@@ -229,13 +231,19 @@ def _note_wrong_index(entry: EventsEntry, ms: int, row: int, findings: Findings)
     )
 
 
-def _note_short_index(entry: EventsEntry, length: int, needed: int, findings: Findings) -> None:
+def _note_short_index(entry: EventsEntry, file: h5py.File, needed: int, findings: Findings) -> None:
+    remedy = "Rebuild ms_to_idx."
+    first, last = int(file["events/t"][0]), int(file["events/t"][-1])
+    if last - first < first:  # such as the time since 1970, whose index no disk holds
+        remedy = (
+            f"Subtract {first // 1000 * 1000} from t, add it to t_offset and rebuild ms_to_idx."
+        )
     findings.error(
         entry.file,
         "ms_to_idx",
-        f"{length} milliseconds",
+        f"{len(file['ms_to_idx'])} milliseconds",
         f"at least {needed}, one per millisecond up to the last event",
-        "Rebuild ms_to_idx.",
+        remedy,
     )
 
 
@@ -313,7 +321,7 @@ class _Scan:
     def rest_of_index(self, total: int) -> None:
         length = len(self.file["ms_to_idx"])
         if self.next_ms > length:
-            _note_short_index(self.entry, length, self.next_ms, self.findings)
+            _note_short_index(self.entry, self.file, self.next_ms, self.findings)
             return
         stored = self.file["ms_to_idx"][self.next_ms :].astype(np.int64)
         self.compare_index(stored, np.full(len(stored), total))

@@ -112,7 +112,7 @@ class Fields:
         if value is None:
             return 0
         if not is_whole(value):
-            self.fail(key, brief(value), "a whole number", "Correct it.")
+            self.fail(key, brief(value), f"a whole number up to {_LARGEST:g}", "Correct it.")
             return 0
         if minimum is not None and value < minimum:
             self.fail(key, brief(value), f"a number of at least {minimum}", "Correct it.")
@@ -123,7 +123,7 @@ class Fields:
         value = self.get(key, default)
         if value is None:
             return None
-        expected = f"{'x'.join(map(str, shape))} finite numbers"
+        expected = f"{'x'.join(map(str, shape))} finite numbers up to {_LARGEST:g}"
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):

@@ -53,16 +53,20 @@ def parse_novel_views(
 ) -> tuple[NovelView, ...]:
     """The pictures of other cameras that have no errors."""
     names = {frame.name for frame in frames}
+    declared = top.value.get("frames")
+    all_valid = isinstance(declared, list) and len(declared) == len(frames)
     views: list[NovelView] = []
     seen: set[tuple[str, str]] = set()
     for index, value in enumerate(top.entries("novel_views", [])):
         keys = ("camera", "frame", "time_us", "image")
         entry = top.inner(f"novel_views[{index}]", value, keys)
         camera, frame = entry.text("camera"), entry.text("frame")
-        _check_camera(entry, camera, cameras)
+        _check_camera(top, entry, camera, cameras)
         time_us, image = entry.integer("time_us"), entry.path("image")
         if entry.valid and frame not in names:
-            entry.fail("frame", repr(frame), "the name of a valid frame", "Correct it.")
+            if all_valid:
+                entry.fail("frame", repr(frame), "the name of a frame", "Correct it.")
+            entry.valid = False  # perhaps of a frame whose own fault is noted
         if entry.valid and (camera, frame) in seen:
             entry.fail(
                 "frame",
@@ -104,7 +108,7 @@ def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> F
     keys = ("name", "camera", "image", "exposure_us", "split", "sharp", "mask", "gain")
     entry = top.inner(f"frames[{index}]", value, (*keys, "world_to_camera"))
     name, camera = entry.name("name"), entry.text("camera")
-    _check_camera(entry, camera, cameras)
+    _check_camera(top, entry, camera, cameras)
     image = entry.path("image")
     exposure = _exposure(entry)
     split = entry.text("split", default_split(index))
@@ -120,15 +124,15 @@ def _frame(top: Fields, index: int, value: Any, cameras: dict[str, Camera]) -> F
     return Frame(name, index, camera, str(image), exposure, kind, sharp, mask, pose, gain)
 
 
-def _check_camera(entry: Fields, camera: str, cameras: dict[str, Camera]) -> None:
-    declared = entry.valid and camera in cameras
-    if entry.valid and not declared:
-        entry.fail(
-            "camera",
-            repr(camera),
-            f"one of the valid cameras {sorted(cameras)}",
-            "Correct the name or the camera's entry.",
-        )
+def _check_camera(top: Fields, entry: Fields, camera: str, cameras: dict[str, Camera]) -> None:
+    """A finding where nothing declares the camera; a fault of its own is noted once, not here."""
+    if not entry.valid or camera in cameras:
+        return
+    declared = top.value.get("cameras")
+    if not isinstance(declared, dict) or camera not in declared:
+        expected = f"one of the cameras {sorted(cameras)}"
+        entry.fail("camera", repr(camera), expected, "Correct the name or add the camera.")
+    entry.valid = False
 
 
 def _exposure(entry: Fields) -> tuple[int, int] | None:

@@ -8,7 +8,7 @@ t >= 1000 m; `t_offset` is added to every t. Times that leave this module are on
 import copy
 import functools
 import os
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -317,8 +317,9 @@ class EventStore:
         """Index of the first event at or after a millisecond of the file's clock."""
         data = self._open()
         count = int(data["events/t"].shape[0])
-        if millisecond < 0:
-            return 0
+        if millisecond < 0:  # of which the index has no entries
+            before_zero = range(self._index_at_ms(0))
+            return bisect_left(before_zero, 1000 * millisecond, key=self._time_of)
         if millisecond >= data["ms_to_idx"].shape[0]:
             return count
         row = int(self._read("ms_to_idx", millisecond, millisecond + 1)[0])
@@ -330,7 +331,9 @@ class EventStore:
         """`_index_at_ms` of many."""
         data = self._open()
         count, length = int(data["events/t"].shape[0]), int(data["ms_to_idx"].shape[0])
-        rows = np.where(milliseconds < 0, 0, count)
+        rows = np.full(len(milliseconds), count)
+        for at in np.flatnonzero(milliseconds < 0):
+            rows[at] = self._index_at_ms(int(milliseconds[at]))
         for piece in range(0, length, INDEX_PIECE):
             within = (milliseconds >= piece) & (milliseconds < min(piece + INDEX_PIECE, length))
             if within.any():
