@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from evsplat.capture import load_capture
 from evsplat.errors import WeightsError
 from evsplat.pictures.files import read_image, write_image
+from evsplat.pictures.light import decode, encode
 from evsplat.synthesis import super_slomo, synthesize
 from evsplat.synthesis.interpolate import Picture
 from evsplat.synthesis.super_slomo import SuperSloMo, UNet, backward_warp
@@ -179,6 +180,35 @@ def test_a_standing_picture_stays_as_it_is_whatever_curve_its_camera_states(tmp_
     assert capture.events is not None
     seen = capture.events.between(*capture.events.time_range_us)
     assert not ((seen.x < 63) & (seen.y < 31)).any()
+
+
+def test_light_stored_as_it_stands_is_looked_at_as_if_it_were_coded(tmp_path, rng):
+    """Two cameras record one scene, as light and by the curve of sRGB: the same comes of both."""
+    image, made = 0.3 * texture(32, 64, int(rng.integers(1000))), {}
+    for transfer in ("srgb", "linear"):
+        folder = tmp_path / transfer
+        folder.mkdir()
+        camera = {"width": 64, "height": 32, "K": [[50, 0, 32], [0, 50, 16], [0, 0, 1]]}
+        camera |= {"world_to_camera": np.eye(4).tolist(), "transfer": transfer}
+        (tmp_path / "camera.json").write_text(json.dumps(camera))
+        for index in range(5):
+            light = torch.from_numpy(shifted(image, 3.0 * index, 0).clip(0, 1))
+            values = encode(light, transfer).numpy()
+            write_image(folder / f"{index}.png", (values * 65535 + 0.5).astype(np.uint16))
+        out = synthesize(
+            folder,
+            tmp_path / f"{transfer}_out",
+            source_fps=100,
+            camera=tmp_path / "camera.json",
+            interpolation="super-slomo",
+            weights=checkpoint(tmp_path / "made_up.ckpt"),
+            events="none",
+            upsample=3,
+            progress=False,
+        )
+        stored = [read_image(frame.image) / 65535 for frame in load_capture(out).frames]
+        made[transfer] = decode(torch.from_numpy(np.stack(stored)), transfer).numpy()
+    assert made["linear"] == pytest.approx(made["srgb"], abs=1e-4)
 
 
 def test_missing_weights_say_what_and_where(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ class Picture:
     """A sharp picture in both of its forms, grey (C = 1) or RGB (C = 3)."""
 
     coded: Float[np.ndarray, "H W C"]
-    """Values as stored, float32 in [0, 1]."""
+    """Values to look at, float32 in [0, 1]: as stored, or coded where these are light."""
     linear: Float[np.ndarray, "H W C"]
     """Linear light, float32 in [0, 1]."""
 

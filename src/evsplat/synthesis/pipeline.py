@@ -20,7 +20,7 @@ from evsplat.events import SensorSettings, sensor_settings, simulate_events
 from evsplat.footage import TimedPicture, open_footage
 from evsplat.options import SynthesisSettings
 from evsplat.options.declare import given
-from evsplat.pictures.light import Transfer, decode, encode
+from evsplat.pictures.light import Transfer, decode, encode, transfer_shown
 from evsplat.synthesis.exposure import Exposure, ExposureMean, Plan, plan_exposures
 from evsplat.synthesis.interpolate import Interpolator, Picture
 from evsplat.synthesis.sources import CaptureSource, FootageSource, RecordedEvents, Source
@@ -71,7 +71,7 @@ def synthesize(
     source, out = Path(source), Path(out)
     opened = _open(source, source_fps, body, pose_source, camera)
     settings = _with_own_transfer(settings, opened)
-    interpolator = _interpolator(settings, weights)  # decodes by the camera's own curve
+    interpolator = _interpolator(settings, _coding(opened, settings), weights)
     plan = plan_exposures(opened.footage.times_us, settings)
     recorded = opened.events() if settings.events == "source" else None
     if settings.split == "source":
@@ -113,6 +113,7 @@ class _Making:
         """Names and mid-exposures of the frames written so far."""
         self._source, self._settings, self._writer = source, settings, writer
         self._plan, self._interpolator = plan, interpolator
+        self._coding = _coding(source, settings)
         self._mean = ExposureMean(plan)
         self._truth: dict[int, TimedPicture] = {}
         self._rng = np.random.default_rng(settings.seed)
@@ -135,7 +136,7 @@ class _Making:
         )
         before: Picture | None = None
         for index, timed in enumerate(bar):
-            after = _picture(timed.pixels, self._settings.transfer)
+            after = _picture(timed.pixels, self._settings.transfer, self._coding)
             if before is not None:
                 if before.linear.shape != after.linear.shape:
                     raise DataError(
@@ -204,7 +205,18 @@ def _with_own_transfer(settings: SynthesisSettings, source: Source) -> Synthesis
     return replace(settings, transfer=own)
 
 
-def _interpolator(settings: SynthesisSettings, weights: Path | str | None) -> Interpolator | None:
+def _coding(source: Source, settings: SynthesisSettings) -> Transfer:
+    """Curve of the values in which motion is looked for.
+
+    Light of a camera that stores it as it stands is coded for that (`transfer_shown`); values that
+    ``settings`` alone take for light are averaged as such, and are coded all the same.
+    """
+    return settings.transfer if source.transfer is None else transfer_shown(source.transfer)
+
+
+def _interpolator(
+    settings: SynthesisSettings, coding: Transfer, weights: Path | str | None
+) -> Interpolator | None:
     """None where the source's pictures are all there is."""
     if weights is not None and settings.interpolation != "super-slomo":
         raise ConfigError("--weights: only --interpolation super-slomo has weights.")
@@ -213,7 +225,7 @@ def _interpolator(settings: SynthesisSettings, weights: Path | str | None) -> In
     if settings.interpolation == "super-slomo":
         from evsplat.synthesis.super_slomo import SuperSloMo
 
-        return SuperSloMo(settings.transfer, weights)
+        return SuperSloMo(coding, weights)
     from evsplat.synthesis.flow import FlowInterpolator
 
     return FlowInterpolator()
@@ -234,9 +246,13 @@ def _sensor(settings: SynthesisSettings) -> SensorSettings:
     return sensor_settings(settings.sensor, contrast_on=contrast, contrast_off=contrast)
 
 
-def _picture(pixels: np.ndarray, transfer: Transfer) -> Picture:
-    coded = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
-    return Picture(coded, np.atleast_3d(_light_of_values(pixels.dtype, transfer)[pixels]))
+def _picture(pixels: np.ndarray, transfer: Transfer, coding: Transfer) -> Picture:
+    linear = np.atleast_3d(_light_of_values(pixels.dtype, transfer)[pixels])
+    if coding == transfer:
+        coded = np.atleast_3d(pixels).astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    else:
+        coded = encode(torch.from_numpy(linear), coding).numpy()
+    return Picture(coded, linear)
 
 
 @functools.cache

@@ -90,7 +90,7 @@ class UNet(nn.Module):
 class SuperSloMo:
     """Interpolates with Super SloMo (`Interpolator`).
 
-    ``transfer`` decodes what the networks give, which is coded as the input.
+    ``transfer`` decodes what the networks give, which is coded as the input (`Picture.coded`).
     """
 
     def __init__(self, transfer: Transfer, weights: Path | str | None = None) -> None:
