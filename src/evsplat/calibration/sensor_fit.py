@@ -4,12 +4,12 @@ Least squares of what events lack to be what frames change by, step by step (Luc
 the place and of the lag of the events' clock together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from scipy.ndimage import map_coordinates
 
 from evsplat.calibration.brightness import EventSource, FramePair
@@ -19,6 +19,9 @@ _GROUPS = 8
 """Stretches of the recording, each of which is left out once to see what that changes."""
 _FEWEST = 6
 """Of them with events, below which nothing is known of errors."""
+_ALIKE = 1.5
+"""Stretches err alike, as what moves goes on and events are late by more of what is slow: errors
+are larger by this than stretches differ by (docs/experiments/ladder.md)."""
 _NUMBERS = 10
 """Fitted at most: gain, lag, and the first eight numbers of the matrix."""
 _LAG_STEP_US = 1_000.0
@@ -91,6 +94,8 @@ class Fit:
     matrix: Matrix
     """From the frames' `Views.grid` to the sensor's, whose maps are measured likewise."""
     lag_us: float
+    blur: float
+    """Standard deviation in pixels of the frames' maps."""
     correlation: float
     normal: Float[np.ndarray, "G 10 10"]
     right: Float[np.ndarray, "G 10"]
@@ -107,29 +112,36 @@ class Fit:
         found: Float[np.ndarray, 10] = basis @ (np.linalg.solve(alike, vector / size) / size)
         return found
 
-    def left_out(self, basis: Basis) -> Float[np.ndarray, "G"]:
-        """Of each group's events, what a step fitted to the others does not tell: squares."""
-        steps = [self.step(basis, without=group) for group in range(len(self.right))]
-        parts = zip(steps, self.normal, self.right, self.squares, strict=True)
-        return np.array([rest - 2 * one @ b + one @ a @ one for one, a, b, rest in parts])
+    def apart(self, other: "Fit", points: Float[np.ndarray, "3 N"]) -> Float[np.ndarray, "N"]:
+        """How far from each other two fits put points of the frames' grid, in its unit."""
+        moved = _projected(np.linalg.inv(self.matrix) @ other.matrix, points)
+        return np.hypot(*(moved - points[:2]))
 
     def error(
-        self, basis: Basis, points: Float[np.ndarray, "3 N"]
-    ) -> tuple[Float[np.ndarray, "N"], float]:
-        """Standard error of where points of the frames' grid lie, in its unit, and of the lag, us.
+        self, views: Views, basis: Basis, points: Float[np.ndarray, "3 N"]
+    ) -> Float[np.ndarray, "N"]:
+        """Standard error of where points of the frames' grid lie, in its unit.
 
-        Jackknife over groups, which are stretches of the recording; infinite where few tell.
+        Jackknife over groups, which are stretches of the recording; infinite where few tell. Steps
+        follow the slopes of the frames: by those of the events, whose noise is in them, all groups'
+        steps are too short to tell how far each one leads.
         """
         told = [group for group, rest in enumerate(self.squares) if rest > 0]
         if len(told) < _FEWEST:
-            return np.full(points.shape[1], np.inf), float("inf")
-        whole, back = self.step(basis), np.linalg.inv(self.matrix)
-        steps = np.stack([self.step(basis, without=group) - whole for group in told])
+            return np.full(points.shape[1], np.inf)
+        normal, right = np.zeros_like(self.normal), np.zeros_like(self.right)
+        for laid in _laid(views, self.matrix, self.lag_us, self.blur):
+            smooth = laid.columns(laid.slopes_of_frames())
+            normal[laid.group] += smooth @ laid.columns(laid.slopes).T
+            right[laid.group] += smooth @ laid.value
+        by_frames = replace(self, normal=normal, right=right)
+        back = np.linalg.inv(self.matrix)
+        whole = by_frames.step(basis)
+        steps = [by_frames.step(basis, without=group) - whole for group in told]
         places = np.stack([_projected(back @ _changed(self.matrix, one), points) for one in steps])
         share = (len(told) - 1) / len(told)
         far = np.square(places - places.mean(0)).sum((0, 1))
-        lag = np.square(steps[:, 1] - steps[:, 1].mean()).sum()
-        return np.sqrt(share * far), float(np.sqrt(share * lag))
+        return _ALIKE * np.sqrt(share * far)
 
 
 def fit(
@@ -167,8 +179,50 @@ def fit(
     return found
 
 
-def _equations(views: Views, matrix: Matrix, lag_us: float, blur: float) -> Fit:
-    """What events tell, as gain times what frames change by less what a step would change."""
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """What events tell of a pair of frames, and what these change by, at pixels that both see."""
+
+    group: int
+    matrix: Matrix
+    points: Float[np.ndarray, "2 N"]
+    """Of the frames' grid."""
+    at: Float[np.ndarray, "2 N"]
+    """Where these lie on the sensor."""
+    w: Float[np.ndarray, "N"]
+    change: Float[np.ndarray, "N"]
+    change_slopes: Float[np.ndarray, "2 N"]
+    """Along rows and columns of the frames' grid."""
+    value: Float[np.ndarray, "N"]
+    later: Float[np.ndarray, "N"]
+    slopes: Float[np.ndarray, "2 N"]
+    """Of ``value``, along the sensor's."""
+
+    def columns(self, slopes: Float[np.ndarray, "2 N"]) -> Float[np.ndarray, "10 N"]:
+        """By what each number changes what events tell, with its sign: they are told less a step.
+
+        ``slopes``: how that changes along the sensor's rows and columns.
+        """
+        x, y = self.points
+        dx, dy = slopes / self.w
+        dw = -(dx * self.at[0] + dy * self.at[1])
+        return np.stack([self.change, -self.later,
+                         *(-one for d in (dx, dy) for one in (d * x, d * y, d)),
+                         -dw * x, -dw * y])  # fmt: skip
+
+    def slopes_of_frames(self) -> Float[np.ndarray, "2 N"]:
+        """Those of ``change``, along the sensor's rows and columns."""
+        moves = (self.matrix[:2, :2] - self.at.T[..., None] * self.matrix[2, :2]) / self.w[
+            :, None, None
+        ]
+        slopes: Float[np.ndarray, "2 N"] = np.einsum(
+            "nij,in->jn", np.linalg.inv(moves), self.change_slopes
+        )
+        return slopes
+
+
+def _laid(views: Views, matrix: Matrix, lag_us: float, blur: float) -> Iterator[_Laid]:
+    """Each pair of frames, with events laid onto it."""
     height, width = views.sensor
     half = max(height, width) / 2
     grid = views.grid
@@ -177,47 +231,48 @@ def _equations(views: Views, matrix: Matrix, lag_us: float, blur: float) -> Fit:
     x, y = at * half + np.array([[(width - 1) / 2], [(height - 1) / 2]])
     inside = (w > 0) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     # blurred alike in the pictures, whatever the size of the pixels
-    finer = np.sqrt(abs(np.linalg.det(matrix[:2, :2]))) * half * 2 / max(views.frames.shape[1:])
+    side = max(views.frames.shape[1:]) / 2
+    finer = np.sqrt(abs(np.linalg.det(matrix[:2, :2]))) * half / side
     before, told, after = views.told(lag_us + np.array([-1.0, 0, 1]) * _LAG_STEP_US)
     seen = blurred(told, blur * finer)
     late = blurred(after - before, blur * finer) / (2 * _LAG_STEP_US)
-    right, down = (np.gradient(seen * half, axis=axis) for axis in (2, 1))
-    target = blurred(views.frames, blur).reshape(len(seen), -1)[:, inside]
-    groups = np.arange(len(seen)) * _GROUPS // len(seen)
+    to = np.stack([y, x])[:, inside]
+    for index, frame in enumerate(blurred(views.frames, blur)):
+        maps = (seen[index], late[index], *np.gradient(seen[index] * half)[::-1])
+        value, later, dx, dy = (map_coordinates(one, to, order=1) for one in maps)
+        yield _Laid(
+            index * _GROUPS // len(seen),
+            matrix,
+            grid[:2, inside],
+            at[:, inside],
+            w[inside],
+            frame.ravel()[inside],
+            np.stack([one.ravel()[inside] for one in np.gradient(frame * side)[::-1]]),
+            value,
+            later,
+            np.stack([dx, dy]),
+        )
+
+
+def _equations(views: Views, matrix: Matrix, lag_us: float, blur: float) -> Fit:
+    """What events tell, as gain times what frames change by less what a step would change."""
     found = Fit(
         matrix,
         lag_us,
+        blur,
         0.0,
         np.zeros((_GROUPS, _NUMBERS, _NUMBERS)),
         np.zeros((_GROUPS, _NUMBERS)),
         np.zeros(_GROUPS),
     )
-    to = np.stack([y, x])[:, inside]
-    for group, change, *maps in zip(groups, target, seen, late, right, down, strict=True):
-        value, later, dx, dy = (map_coordinates(one, to, order=1) for one in maps)
-        columns = _columns(change, later, dx / w[inside], dy / w[inside], grid, at, inside)
-        found.normal[group] += columns @ columns.T
-        found.right[group] += columns @ value
-        found.squares[group] += value @ value
+    for laid in _laid(views, matrix, lag_us, blur):
+        columns = laid.columns(laid.slopes)
+        found.normal[laid.group] += columns @ columns.T
+        found.right[laid.group] += columns @ laid.value
+        found.squares[laid.group] += laid.value @ laid.value
     power = found.normal[:, 0, 0].sum() * found.squares.sum()
     correlation = found.right[:, 0].sum() / np.sqrt(power) if power > 0 else 0.0
     return replace(found, correlation=float(correlation))
-
-
-def _columns(
-    change: Float[np.ndarray, "N"],
-    later: Float[np.ndarray, "N"],
-    dx: Float[np.ndarray, "N"],
-    dy: Float[np.ndarray, "N"],
-    grid: Float[np.ndarray, "3 M"],
-    at: Float[np.ndarray, "2 M"],
-    inside: Bool[np.ndarray, "M"],
-) -> Float[np.ndarray, "10 N"]:
-    """By what each number changes what events tell, with its sign: they are told less a step."""
-    x, y = grid[:2, inside]
-    dw = -(dx * at[0, inside] + dy * at[1, inside])
-    return np.stack([change, -later, *(-one for d in (dx, dy) for one in (d * x, d * y, d)),
-                     -dw * x, -dw * y])  # fmt: skip
 
 
 def _changed(matrix: Matrix, step: Float[np.ndarray, "10"]) -> Matrix:

@@ -33,9 +33,9 @@ _NEAR = 0.1
 """Of the longer side: guesses that lie so near each other, over what moves, are one."""
 _COARSE, _FINE = (3.0, 2.0, 1.0), (1.0,)
 """Standard deviations of blurs for the fits, one after the other."""
-_SURELY_BETTER, _BETTER = 2.5, 0.02
-"""A homography has to tell so many standard errors more of what was left out of the fit than a
-similarity does, and by this share: perspective that is not there costs more than it gains."""
+_SURELY_APART = 1.4
+"""A homography has to put what moves so many of its standard errors away from where a similarity
+does: perspective that is not there costs where nothing moves."""
 _MOVES = 0.8
 """Pixels are asked for errors that change more than this share of all."""
 
@@ -243,16 +243,16 @@ def _fitted(
     start = to_sensor @ np.linalg.inv(to_picture @ homography)
     basis = any_similarity(start)
     found = fit(views, start, lag_us, basis, _COARSE)
-    plain, free = found.left_out(basis), found.left_out(ANY_HOMOGRAPHY)
-    gain = plain - free
-    surely = gain.mean() > _SURELY_BETTER * gain.std(ddof=1) / math.sqrt(len(gain))
+    free = fit(views, found.matrix, found.lag_us, ANY_HOMOGRAPHY, _FINE)
     half = max(frames.shape[1:]) / 2 * step
-    error = _of_most(found.error(basis, views.grid)[0], frames) * half
-    if surely and gain.sum() > _BETTER * plain.sum():
-        better = fit(views, found.matrix, found.lag_us, ANY_HOMOGRAPHY, _FINE)
-        of_better = _of_most(better.error(ANY_HOMOGRAPHY, views.grid)[0], frames) * half
-        if better.correlation > found.correlation and of_better <= MOST_ERROR * 2 * half:
-            found, error = better, of_better
+    told = half * found.error(views, basis, views.grid)
+    of_free = _of_most(half * free.error(views, ANY_HOMOGRAPHY, views.grid), frames)
+    apart = half * free.apart(found, views.grid)
+    surely = _of_most(apart, frames) > _SURELY_APART * of_free
+    if surely and free.correlation > found.correlation and of_free <= MOST_ERROR * 2 * half:
+        found, error = free, of_free
+    else:  # what a similarity leaves out is an error too
+        error = _of_most(np.hypot(told, apart), frames)
     place = np.linalg.inv(to_picture) @ np.linalg.inv(found.matrix) @ to_sensor
     place /= place[2, 2]
     if not np.abs(found.matrix[2, :2]).any():
