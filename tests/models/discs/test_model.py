@@ -240,6 +240,23 @@ def test_without_lamps_there_is_no_shadow_and_light_is_the_polynomial(tiny_captu
     assert bare.shading is None and bare.surface_light() is None
 
 
+@pytest.mark.parametrize("far_m", [0.2, 5.0])
+def test_light_varies_with_the_place_by_how_far_the_person_goes(tiny_capture, far_m):
+    """From the middle of their way, whose farthest place is 1 away, or a metre where they stay."""
+    path = tiny_capture()
+    with np.load(path / "body.npz") as file:
+        body = dict(file)
+    along = np.linspace(0, 1, len(body["transl"]))
+    body["transl"] = far_m * along[:, None] * np.array([0.6, 0.8, 0]) + body["transl"][:1]
+    np.savez(path / "body.npz", **body)
+    model, capture, *_ = model_of(path)
+    times = [frame.mid_us for frame in capture.train_frames]
+    roots = np.stack([np.interp(times, body["times_us"], row) for row in body["transl"].T], 1)
+    away = np.linalg.norm(roots - roots.mean(0), axis=1).max()
+    assert float(model.shading.radius_m) == pytest.approx(max(1.0, away), rel=1e-3)
+    assert (away > 1) == (far_m > 1)
+
+
 @pytest.mark.parametrize("middle", range(3))
 def test_a_training_step_shades_by_the_pose_at_the_middle_of_its_frame(tiny_capture, middle):
     model, capture, _, center = model_of(tiny_capture(), "pose_noise=0", "shading=false")

@@ -7,7 +7,7 @@ import torch
 
 from evsplat.capture import Policy, load_capture
 from evsplat.gaussians.surround import cell_px, continued
-from evsplat.models.discs.outskirts import PRICE, outskirts
+from evsplat.models.discs.outskirts import outskirts
 from evsplat.models.discs.still import Still
 from evsplat.models.seen import fixed
 from evsplat.render import render
@@ -88,7 +88,7 @@ def test_their_cost_is_that_of_the_best_colours(rainbow):
 
     def cost(colours):
         missed = drawn(scene, colours, recording, model.low_pass) - before
-        held = PRICE * cell**2 * (colours - told).square()
+        held = cell**2 / 800 * (colours - told).square()
         return missed.square().sum() + held[beyond > -2].sum()
 
     def least(start):
