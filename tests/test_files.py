@@ -34,6 +34,11 @@ def test_an_interrupted_writer_leaves_the_old_file(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
+def test_bytes_of_a_name_that_are_no_utf8_can_be_told_in_a_text(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", f"é {os.fsdecode(bytes([255]))}")
+    assert (tmp_path / "a.txt").read_text() == "é \\udcff"
+
+
 def test_a_pipe_is_written_into_and_stays(tmp_path: Path) -> None:
     """As /dev/stdout and /dev/null must."""
     pipe = tmp_path / "pipe.json"
@@ -230,6 +235,17 @@ def test_a_write_that_fails_is_one_sentence(
         raise OSError(number, os.strerror(number))
     assert str(error.value).startswith(f"{tmp_path / 'a.bin'}: {said}")
     assert error.value.no_room == no_room and list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_a_new_folder_that_fails_is_named_by_where_it_was_to_be(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError) as error,
+        new_folder(tmp_path / "new") as folder,
+        atomic_path(folder / "a.bin"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert str(error.value).startswith(f"{tmp_path / 'new' / 'a.bin'}: not written, the disk is")
+    assert error.value.no_room and list(tmp_path.iterdir()) == []
 
 
 def test_a_read_that_fails_while_something_is_written_is_not_the_output_s_fault(

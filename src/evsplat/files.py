@@ -107,7 +107,7 @@ def new_folder(path: Path | str, *, replace: bool = False) -> Iterator[Path]:
         if not replace:
             refuse_existing(path)
         with _folder_of(path), temporary_folder(path.parent) as temporary:
-            with errors.of_writing():
+            with errors.of_writing(), _named_by(path, temporary):
                 yield temporary
             temporary.chmod(0o777 & ~_umask())
             flush_below(temporary)
@@ -117,6 +117,16 @@ def new_folder(path: Path | str, *, replace: bool = False) -> Iterator[Path]:
                 refuse_existing(path)
                 temporary.rename(path)
             flush_folder(path.parent)
+
+
+@contextmanager
+def _named_by(path: Path, temporary: Path) -> Iterator[None]:
+    """What could not be written below a temporary folder is told by the name that was asked for."""
+    try:
+        yield
+    except OutputError as error:
+        told = str(error).replace(str(temporary), str(path))
+        raise OutputError(told, no_room=error.no_room) from error
 
 
 @contextmanager
@@ -233,8 +243,11 @@ def write_pieces(path: Path | str, pieces: Iterable[bytes | memoryview]) -> None
 
 
 def write_text(path: Path | str, text: str) -> None:
-    """Write ``text`` as UTF-8, whole or not at all."""
-    write_bytes(path, text.encode())
+    """Write ``text`` as UTF-8, whole or not at all.
+
+    What UTF-8 cannot hold, such as other bytes of a file's name, is escaped as on standard output.
+    """
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_json(path: Path | str, value: Any) -> None:

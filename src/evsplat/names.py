@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 
 from evsplat.errors import DataError
 
-NAME_RULE = "1 to 200 bytes without '/', '\\' and control characters, and not '.' or '..'"
+NAME_RULE = "1 to 200 bytes of UTF-8 without '/', '\\' and control characters, and not '.' or '..'"
 _MOST_BYTES = 200
 """File systems take 255; the rest is for what is put around a name."""
 # Control characters, and those that end a line or a paragraph.

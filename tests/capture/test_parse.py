@@ -57,7 +57,7 @@ def errors(path: Path, field: str) -> list[Finding]:
 @pytest.mark.parametrize("kind", BAD_NAMES)
 def test_a_name_that_could_write_elsewhere_is_an_error(tiny_capture: Factory, kind: str) -> None:
     path, name = tiny_capture(), BAD_NAMES[kind]
-    rule = "1 to 200 bytes without '/'" if name else "a text"
+    rule = "1 to 200 bytes of UTF-8 without '/'" if name else "a text"
     whole = put(path, ("name",), name)
     assert rule in errors(path, "name")[0].expected
     put(path, ("name",), whole)
@@ -69,7 +69,7 @@ def test_a_name_that_could_write_elsewhere_is_an_error(tiny_capture: Factory, ki
         document["cameras"][name] = document["cameras"].pop("side")
 
     edit(path, rename)
-    assert "1 to 200 bytes without '/'" in errors(path, "cameras")[0].expected
+    assert "1 to 200 bytes of UTF-8 without '/'" in errors(path, "cameras")[0].expected
 
 
 @pytest.mark.parametrize("field", PATHS)

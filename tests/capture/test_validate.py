@@ -411,7 +411,8 @@ def test_overlapping_exposures_are_a_warning(tiny_capture: Factory) -> None:
     path = tiny_capture()
     edit_json(path, "frames", 4, "exposure_us", value=[140_000, 190_000])
     finding = the_only(path, "warning")
-    check(finding, path / "capture.json", "frames[4].exposure_us", "1 exposures", "do not overlap")
+    field = "frames[4].exposure_us"
+    check(finding, path / "capture.json", field, "1 exposure begun", "do not overlap")
     load_capture(path)
 
 
@@ -808,6 +809,12 @@ def test_index_must_reach_the_last_event_and_hold_beyond_it(tiny_capture: Factor
     edit_events(path, "ms_to_idx", lambda index: index[:50])
     finding = the_only(path)
     check(finding, path / "events.h5", "ms_to_idx", "50 milli", f"at least {last_ms + 1}, one")
+
+
+def test_fault_of_the_events_entry_is_not_told_as_its_absence_too(tiny_capture: Factory) -> None:
+    path = tiny_capture()
+    edit_json(path, "events", "clock_offset_us", value=2**62)
+    check(the_only(path), path / "capture.json", "events.clock_offset_us", "46116", "up to 9.0072")
 
 
 def test_times_since_1970_are_to_be_put_into_the_offset(tiny_capture: Factory) -> None:

@@ -143,12 +143,16 @@ def test_page_shows_films_and_links_pages_that_were_made_of_the_run(
     os.mkfifo(renders / "pipe.mp4")
     (exports / "avatar.html").touch()
     (exports / "dancer" / "index.html").touch()
+    (exports / os.fsdecode(b"e?#%\xff.html")).touch()
     parsed = Page(page(evaluated(tiny_capture(), tmp_path)))
     sources = [str(attributes.get("src")) for _, attributes in parsed.elements]
     for kind, content in (("video/mp4", b"film" * 100), ("image/webp", b"loop" * 100)):
         assert f"data:{kind};base64,{base64.b64encode(content).decode()}" in sources
     links = [attributes["href"] for tag, attributes in parsed.elements if tag == "a"]
-    places = ["renders/too%20large.mp4", "exports/avatar.html", "exports/dancer/index.html"]
+    places = [
+        *("renders/too%20large.mp4", "exports/avatar.html"),
+        *("exports/e%3F%23%25%FF.html", "exports/dancer/index.html"),
+    ]
     assert [link for link in links if not link.startswith("#")] == places
     assert name in parsed.text and "b" in parsed.text
     assert "outside" not in parsed.text and "pipe" not in parsed.text
@@ -283,6 +287,25 @@ def test_a_broken_file_of_the_run_is_one_sentence(tiny_capture, tmp_path, name):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=rf"{name}: "):
             Source.read(tmp_path, source.capture, source.reconstruction)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('{"loss": 1}', "it has no iteration"),
+        ('{"iteration": 9, "loss": "abc"}', "loss is 'abc', expected a number or null"),
+        ('{"iteration": 9, "terms": [1]}', "terms is [1], expected an object"),
+        ('{"iteration": 9, "human": 1e308}', "human is 1e+308, expected a number or null"),
+    ],
+)
+def test_line_of_the_log_that_no_training_wrote_is_named(tiny_capture, tmp_path, line, said):
+    """To evaluate again, as is said of other figures, would leave it where it is."""
+    source = evaluated(tiny_capture(), tmp_path)
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write(f"\n{line}\n")
+    with pytest.raises(DataError) as error:
+        Source.read(tmp_path, source.capture, source.reconstruction)
+    assert str(error.value) == f"{tmp_path / 'log.jsonl'}: line 10: {said}; remove the line."
 
 
 def test_lines_of_the_log_that_are_broken_or_deep_are_left_out(tiny_capture, tmp_path):

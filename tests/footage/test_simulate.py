@@ -1,5 +1,6 @@
 """Footage to an event file, by function and by command."""
 
+import os
 import tracemalloc
 from pathlib import Path
 
@@ -117,6 +118,13 @@ def test_file_tells_how_it_was_made(tmp_path: Path) -> None:
     assert (attributes["width"], attributes["height"]) == (WIDTH, HEIGHT)
     assert (attributes["seed"], attributes["transfer"]) == (9, "srgb")
     assert attributes["simulated"] and attributes["source"] == "clip"
+
+
+def test_file_tells_its_source_whatever_bytes_that_is_named_by(tmp_path: Path) -> None:
+    source = folder_of(tmp_path / os.fsdecode(b"clip\xff"), moving_disc(2))
+    ev.simulate(source, tmp_path / "e.h5", source_fps=FPS)
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert file.attrs["source"] == "clip\\udcff"
 
 
 def test_memory_does_not_grow_with_the_events(tmp_path: Path) -> None:

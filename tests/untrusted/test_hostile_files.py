@@ -339,6 +339,15 @@ def test_dense_poses_need_no_more_than_poses(tmp_path: Path) -> None:
     assert "body_dense.npz: transl: found 10x3 of uint8" in said
 
 
+def test_tensors_are_read_whatever_bytes_the_name_of_their_folder_has(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"\xff")
+    folder.mkdir()
+    save_file({"a": torch.arange(3.0)}, tmp_path / "a.safetensors", {"text": "b"})
+    (tmp_path / "a.safetensors").rename(folder / "a.safetensors")
+    tensors, texts = read_safetensors(folder / "a.safetensors")
+    assert torch.equal(tensors["a"], torch.arange(3.0)) and texts == {"text": "b"}
+
+
 def test_ctrl_c_within_a_file_of_tensors_is_not_taken_for_damage(tmp_path: Path, monkeypatch):
     save_file({"a": torch.arange(3.0)}, tmp_path / "a.safetensors")
     part_of = torch.UntypedStorage.__getitem__

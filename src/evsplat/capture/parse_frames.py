@@ -10,6 +10,7 @@ from evsplat.capture.fields import Fields, is_whole
 from evsplat.capture.metadata import Frame, Gain, NovelView
 from evsplat.capture.parse_cameras import rigid
 from evsplat.untrusted.faults import brief
+from evsplat.wording import counted
 
 _LONGEST_EXPOSURE_US = 60_000_000
 _MOST_GAIN = 100
@@ -217,7 +218,7 @@ def _check_frames(top: Fields, frames: list[Frame]) -> None:
         top.findings.warning(
             top.file,
             f"frames[{overlaps[0].index}].exposure_us",
-            f"{len(overlaps)} exposures that begin before the one before ends "
+            f"{counted(len(overlaps), 'exposure')} begun before the one before ended "
             f"(first: frame {overlaps[0].name!r})",
             "exposures that do not overlap",
             "Check the exposure time; a sharp moment is then seen by two frames.",

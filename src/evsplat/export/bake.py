@@ -24,6 +24,7 @@ from evsplat.render import Splats, render
 from evsplat.similarity import psnr
 from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.training.run import Run
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -145,7 +146,7 @@ class Loss:
         sentence = (
             f"Dropped: what poses do beyond skinning and {self.correctives} correctives "
             f"({dropped}). On the "
-            f"person's pixels of {self.frames} test frames the avatar is "
+            f"person's pixels of {counted(self.frames, 'test frame')} the avatar is "
             f"{self.avatar_to_model.person:.2f} dB PSNR from the model"
         )
         if self.model_to_truth is None or self.avatar_to_truth is None:

@@ -19,6 +19,7 @@ from evsplat.export.gaussians import instant_of
 from evsplat.files import write_text
 from evsplat.methods.reconstruction import Parts
 from evsplat.training.run import Run
+from evsplat.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -76,8 +77,8 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
             server.stop()
     write_text(path, page)
     logger.info(
-        "%d pictures, %g per second, colours as camera %s sees them; metres, axes of the capture.",
-        len(times),
+        "%s, %g per second, colours as camera %s sees them; metres, axes of the capture.",
+        counted(len(times), "picture"),
         fps,
         middle.camera_name,
     )

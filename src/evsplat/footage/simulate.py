@@ -77,7 +77,8 @@ def simulate(
     pieces = _gathered(simulate_events(frames, settings, seed))
     attributes = {
         "simulated": True,
-        "source": footage.path.name,
+        # HDF5 has UTF-8 alone for texts, names of files any bytes.
+        "source": footage.path.name.encode("utf-8", "backslashreplace").decode(),
         "transfer": transfer,
         "seed": seed,
         **{f"sensor_{name}": value for name, value in asdict(settings).items()},

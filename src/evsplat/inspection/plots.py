@@ -21,6 +21,7 @@ from evsplat.inspection.drawing import (
     short_number,
     split_colour,
 )
+from evsplat.wording import counted
 
 _WIDTH, _HEIGHT = 1400, 470
 _LEFT, _RIGHT = 96, 24
@@ -111,7 +112,9 @@ def _draw_labels(
     peak: float,
 ) -> None:
     start, end = span
-    subtitle = f"{len(capture.frames)} exposures, {len(_pose_times(capture))} key poses"
+    subtitle = ", ".join(
+        (counted(len(capture.frames), "exposure"), counted(len(_pose_times(capture)), "key pose"))
+    )
     if capture.events is not None:
         subtitle += f", {len(capture.events):,} events"
     header(

@@ -1,6 +1,8 @@
 """Files of torch (.pt, .pth) and of safetensors."""
 
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -31,8 +33,24 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     ordinary_file(path)
     try:
         # torch calls its storage's Python and says of any error there that the shape is unknown.
-        with uninterrupted(), safe_open(path, framework="pt") as file:
+        with (
+            _in_utf8(path) as name,
+            uninterrupted(),
+            safe_open(name, framework="pt") as file,
+        ):
             tensors = {name: file.get_tensor(name) for name in file.keys()}
             return tensors, file.metadata() or {}
     except (*BROKEN, SafetensorError) as error:
         raise ValueError(str(error)) from None
+
+
+@contextmanager
+def _in_utf8(path: Path) -> Iterator[Path]:
+    """A name of the file that is UTF-8: safetensors opens no other, a disk may have any."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with path.open("rb") as file:
+            yield Path(f"/dev/fd/{file.fileno()}")
+    else:
+        yield path

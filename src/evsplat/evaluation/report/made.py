@@ -1,5 +1,6 @@
 """Films and pages that were made of the run: shown and linked at the end of its report."""
 
+import os
 from html import escape
 from pathlib import Path
 from urllib.parse import quote
@@ -52,4 +53,4 @@ def _files(folder: Path, suffixes: tuple[str, ...], pattern: str = "*") -> list[
 
 def _link(folder: Path, path: Path) -> str:
     place = path.relative_to(folder).as_posix()
-    return f'<li><a href="{quote(place)}">{escape(place)}</a></li>'
+    return f'<li><a href="{quote(os.fsencode(place))}">{escape(place)}</a></li>'

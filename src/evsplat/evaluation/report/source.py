@@ -16,7 +16,18 @@ from evsplat.evaluation.splits import name_of
 from evsplat.methods.reconstruction import Reconstruction
 from evsplat.options.runs import Split
 from evsplat.pages import read_rgb
+from evsplat.untrusted.records import misfit
 from evsplat.untrusted.text import parse_json, read_json, read_text
+
+_NUMBER = (float, type(None))
+_DRAWN = {
+    "loss": _NUMBER,
+    "terms": {str: _NUMBER},
+    "psnr": _NUMBER,
+    "human": _NUMBER,
+    "scene": _NUMBER,
+}
+"""What curves are drawn of, where a line of log.jsonl has it."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +86,15 @@ def _read_log(path: Path) -> list[dict[str, Any]]:
     if not path.is_file():
         return []
     entries = []
-    for line in read_text(path).splitlines():
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        entry = None
         with suppress(ValueError):
-            entries.append(parse_json(line))
-    return [entry for entry in entries if isinstance(entry, dict)]
+            entry = parse_json(line)
+        if not isinstance(entry, dict):
+            continue
+        drawn = {key: shape for key, shape in _DRAWN.items() if key in entry}
+        wrong = misfit(entry, {"iteration": int, **drawn})
+        if wrong:
+            raise DataError(f"{path}: line {number}: {wrong}; remove the line.")
+        entries.append(entry)
+    return entries
