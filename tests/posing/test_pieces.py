@@ -154,3 +154,14 @@ def test_where_nobody_is_in_view_the_motion_stays_and_the_rest_is_corrected(
     monkeypatch.setattr(cutting, "_MOST_PIXELS", 1 << 40)
     with pytest.raises(NobodyInViewError, match="nobody"):
         refine(track, capture, steps=(2, 2), discs=100)
+
+
+def test_what_ends_a_correction_is_not_told_behind_its_bar(tiny_capture, monkeypatch, capsys):
+    """A message that goes on in the line of the bar is hard to find."""
+    capture = seen(tiny_capture())
+    monkeypatch.setattr(refining, "_descended", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError) as error:
+        refine(load_body_track(capture), capture, progress=True)
+    shown = capsys.readouterr().err
+    assert "refinement" in shown and shown.endswith("\r")
+    assert error.tb is not None  # which keeps the bar alive, as a message's does

@@ -7,6 +7,7 @@ what is unknown of motion and look is moved downhill until the drawings are like
 import math
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,10 +128,9 @@ def judge(
     shrink = halved(capture.camera(frames[0]), JUDGED_PX)
     pictures = sharp_pictures(capture, frames=frames)
     targets = find_targets(track, capture, pictures, shrink=shrink)
-    limit = TimeLimit(None, 5 * LOOK_STEPS + sum(steps), progress=progress)
     piece = between(track, min(times), max(times))
-    found = _descended(piece, targets, limit, steps, discs, least_gain=LEAST_GAIN)
-    limit.close()
+    with closing(TimeLimit(None, 5 * LOOK_STEPS + sum(steps), progress=progress)) as limit:
+        found = _descended(piece, targets, limit, steps, discs, least_gain=LEAST_GAIN)
     errors = _given_errors(found.descent.correction, len(track.times_us))
     gain, coarse_gain = _mean_gain(found.better), _mean_gain(found.coarse)[0]
     return Verdict(*gain, time.monotonic() - began, coarse_gain, errors)
@@ -160,19 +160,19 @@ def refine(
     refuse_no_background(capture)
     pieces = cut_in_pieces(track, capture)
     planned = 3 * LOOK_STEPS + sum(steps) + _LAST_STEPS + PROBES * PROBE_STEPS
-    limit = TimeLimit(seconds, len(pieces) * planned, progress=progress)
-    pictures = sharp_pictures(capture)
     found, missed = [], None
-    for piece in pieces:
-        given = between(track, piece.start_us, piece.end_us)
-        try:
-            targets = find_targets(given, capture, piece.pictures(pictures), shrink=piece.shrink)
-        except NobodyInViewError as error:
-            missed = error
-            found.append(_Piece(torch.empty(0), _with_errors(given), None))
-            continue
-        found.append(_finished(_descended(given, targets, limit, steps, discs)))
-    limit.close()
+    with closing(TimeLimit(seconds, len(pieces) * planned, progress=progress)) as limit:
+        pictures = sharp_pictures(capture)
+        for piece in pieces:
+            given = between(track, piece.start_us, piece.end_us)
+            own = piece.pictures(pictures)
+            try:
+                targets = find_targets(given, capture, own, shrink=piece.shrink)
+            except NobodyInViewError as error:
+                missed = error
+                found.append(_Piece(torch.empty(0), _with_errors(given), None))
+                continue
+            found.append(_finished(_descended(given, targets, limit, steps, discs)))
     bodies = [one.dressed for one in found if one.dressed is not None]
     if missed is not None and not bodies:
         raise missed
