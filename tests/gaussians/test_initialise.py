@@ -6,8 +6,8 @@ import torch
 from evsplat.body.rotations import quaternion_to_matrix
 from evsplat.capture import Camera
 from evsplat.gaussians.initialise import (
-    _extremes,
     backdrop_depth,
+    extremes,
     facing,
     gaussians_at,
     median_backdrop,
@@ -52,7 +52,7 @@ def test_backdrop_is_a_floor_below_the_feet_and_a_wall_behind():
 def test_a_backdrop_is_the_same_by_pieces_of_any_size(kept, monkeypatch):
     monkeypatch.setattr("evsplat.gaussians.initialise._MOST_LOW", kept)
     up, points = torch.tensor([0.0, 0.0, 1.0]), body_points()
-    deepest, floor = _extremes(camera(), points.split(41), up)
+    deepest, floor = extremes(camera(), points.split(41), up)
     assert deepest == float(camera().project(points)[1].max())
     assert floor == pytest.approx(float(torch.quantile(points @ up, 0.002)), rel=1e-6)
 

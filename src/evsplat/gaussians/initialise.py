@@ -95,7 +95,7 @@ def backdrop_depth(
     never passes will do. The wall stands ``margin`` (a fraction) behind the deepest body point,
     facing the camera; the floor is the plane through the lowest body points, orthogonal to ``up``.
     """
-    deepest, floor_height = _extremes(camera, body_points, up)
+    deepest, floor_height = extremes(camera, body_points, up)
     wall = deepest * (1 + margin)
     rays = pixel_rays(camera)
     camera_height = camera.center() @ up
@@ -105,7 +105,7 @@ def backdrop_depth(
     return torch.where(floor > 0, floor, torch.inf).clamp_max(wall)
 
 
-def _extremes(
+def extremes(
     camera: Camera, pieces: Iterable[Float[Tensor, "M 3"]], up: Float[Tensor, "3"]
 ) -> tuple[float, float]:
     """The largest depth of all points, and the height that one in `_FEET` lies below, metres."""

@@ -11,7 +11,7 @@ from functools import cache, partial
 import torch
 from torch import Tensor
 
-from evsplat.body import BodyTrack
+from evsplat.body import BodyTrack, up_axis
 from evsplat.capture import Camera, Frame, TrainingCapture
 from evsplat.errors import ConfigError
 from evsplat.gaussians import FEATURE_DIM, GaussianSet
@@ -28,12 +28,14 @@ from evsplat.methods.base import (
     start_of_randomness,
 )
 from evsplat.methods.evsplat_settings import DiscRates, EvsplatConfig
+from evsplat.methods.furniture import furnished
 from evsplat.methods.learning import Learning, Network, Rate, parameters_of, row_rates
 from evsplat.methods.moving_background import middle_view, moving_backdrop, require_one_side
 from evsplat.methods.poses import Poses, prepare_poses
 from evsplat.methods.prefit import fit_scene
+from evsplat.methods.room import find_room
 from evsplat.methods.sensor import event_windows
-from evsplat.methods.starts import Backdrop, Surface, human_start, scene_start
+from evsplat.methods.starts import Backdrop, Surface, human_start, places, scene_start
 from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
@@ -238,7 +240,11 @@ def _background(
     if not fit:
         return None
     picture = background_without(capture, track, config.semantic_band_px_at_256)
-    return Backdrop(capture.camera(capture.train_frames[0]), picture)
+    camera = capture.camera(capture.train_frames[0])
+    body = places(capture, track)
+    room = find_room(camera, picture, body, up_axis(track))
+    shares = None if room is None else furnished(camera, picture, room, body)
+    return Backdrop(camera, picture, depth_shares=shares, room=room)
 
 
 def _fit_colours(

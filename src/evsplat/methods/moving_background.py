@@ -22,7 +22,7 @@ from evsplat.gaussians.initialise import backdrop_depth, pixel_rays
 from evsplat.gaussians.surround import margins
 from evsplat.methods.background import NEVER, apart, looked_at, median_far_away
 from evsplat.methods.plane_sweep import Shot, depth_shares
-from evsplat.methods.starts import Backdrop, posed
+from evsplat.methods.starts import Backdrop, places
 
 MOST_TURN_DEG = 45.0
 """Turn of a camera from the middle of its way up to which one sheet stands for the scene: what is
@@ -31,8 +31,6 @@ WALLS = (0.15, 0.3, 0.5, 0.75, 1.1, 1.6, 2.5)
 """Distances of the wall behind the deepest body point that are compared, as shares of its depth."""
 COMPARED_FRAMES, COMPARED_PIXELS, SWEPT_FRAMES = 12, 65_536, 24
 """Of the comparison of walls, and frames that tell the depth of each pixel, at most."""
-BODY_FRAMES = 512
-"""Training frames, at most, that tell where the person goes."""
 WELL_AWAY = 3.0
 """Bands from the body at which a frame tells how far away the scene is: nearer by, shadows move."""
 _TELLING = 0.02
@@ -67,8 +65,7 @@ def moving_backdrop(capture: TrainingCapture, track: BodyTrack, band_px_at_256: 
     frames = looked_at(capture)
     band = band_px_at_256 * middle.height / 256
     seen = [_Seen.of(capture, track, frame, WELL_AWAY * band) for frame in frames]
-    every = -(-len(capture.train_frames) // BODY_FRAMES)
-    body = _Body(torch.cat([*posed(track, capture.train_frames[::every])]), up_axis(track))
+    body = _Body(places(capture, track), up_axis(track))
     share, spread = WALLS[0], math.inf
     few = seen[:: -(-len(seen) // COMPARED_FRAMES)]
     step = max(1, math.isqrt(middle.width * middle.height // COMPARED_PIXELS))

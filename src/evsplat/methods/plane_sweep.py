@@ -62,7 +62,7 @@ def depth_shares(
     step = max(1, math.ceil(math.sqrt(view.width * view.height / MOST_PIXELS)))
     shots = [_smaller(shot, step) for shot in shots]
     coarse = view.smaller(step, whole=False)
-    given = _pooled(depth[..., None], step)[..., 0]
+    given = pooled(depth[..., None], step)[..., 0]
     parallax = _parallax_px(coarse, given, shots)
     if parallax < LEAST_PARALLAX_PX:
         return torch.ones_like(depth)
@@ -79,8 +79,7 @@ def depth_shares(
     costs += _ELSEWHERE * (inverse != 1)[:, None, None]
     chosen = torch.from_numpy(median_filter(_smooth(costs).numpy(), _WINDOW, mode="nearest"))
     shares = 1 / (inverse[chosen] + (inverse[1] - inverse[0]) * _between(costs, chosen))
-    fine = shares.repeat_interleave(step, 0).repeat_interleave(step, 1)
-    return fine[: view.height, : view.width]
+    return enlarged(shares, step)[: view.height, : view.width]
 
 
 def _parallax_px(view: Camera, depth: Float[Tensor, "H W"], shots: Sequence[Shot]) -> float:
@@ -183,10 +182,16 @@ def _along(lines: Float[Tensor, "L N M"]) -> Float[Tensor, "L N M"]:
 
 
 def _smaller(shot: Shot, step: int) -> Shot:
-    free = _pooled(shot.free[..., None], step)[..., 0]
-    return Shot(shot.camera.smaller(step, whole=False), _pooled(shot.picture, step), free)
+    free = pooled(shot.free[..., None], step)[..., 0]
+    return Shot(shot.camera.smaller(step, whole=False), pooled(shot.picture, step), free)
 
 
-def _pooled(values: Float[Tensor, "H W C"], step: int) -> Float[Tensor, "h w C"]:
+def pooled(values: Float[Tensor, "H W C"], step: int) -> Float[Tensor, "h w C"]:
+    """Means of squares of ``step`` pixels, smaller ones at the right and at the bottom."""
     means = avg_pool2d(values.movedim(-1, 0)[None], step, ceil_mode=True, count_include_pad=False)
     return means[0].movedim(0, -1)
+
+
+def enlarged(values: Float[Tensor, "h w"], step: int) -> Float[Tensor, "H W"]:
+    """Each value in a square of ``step`` pixels."""
+    return values.repeat_interleave(step, 0).repeat_interleave(step, 1)

@@ -24,6 +24,7 @@ from evsplat.gaussians.initialise import (
     random_cube,
 )
 from evsplat.gaussians.surround import margins, surround
+from evsplat.methods.room import Room
 from evsplat.ranges import Above, AtLeast, ReadIf
 
 MOST_SAMPLES = 20_000
@@ -36,6 +37,8 @@ BACKDROP_MARGIN = 0.15
 
 _STRIDE, _FRAMES_AT_ONCE = 7, 64
 """Of the vertices of the body that lie before the backdrop, and of frames, in one piece."""
+BODY_FRAMES = 512
+"""Training frames, at most, that tell where the person goes."""
 
 _CUBE = ReadIf("scene.kind", "random_cube", lambda kind: kind == "random_cube")
 _BACKDROP = ReadIf("scene.kind", "median_backdrop", lambda kind: kind == "median_backdrop")
@@ -109,6 +112,8 @@ class Backdrop:
     """Distance of the wall behind the deepest body point, as a fraction of its depth."""
     depth_shares: Float[Tensor, "H W"] | None = None
     """Depth of the scene as a share of that of floor and wall, where frames tell it."""
+    room: Room | None = None
+    """In place of the floor and of the wall at ``margin``, where the picture tells it."""
 
 
 FROM_MEDIAN = FittedScene(
@@ -180,6 +185,12 @@ def posed(track: BodyTrack, frames: Sequence[Frame]) -> Iterator[Float[Tensor, "
         yield skin(points, weights, track.bones(times))[0].flatten(0, 1)
 
 
+def places(capture: TrainingCapture, track: BodyTrack) -> Float[Tensor, "M 3"]:
+    """Where the person goes: every `_STRIDE`-th vertex at `BODY_FRAMES` training frames at most."""
+    frames = capture.train_frames
+    return torch.cat([*posed(track, frames[:: -(-len(frames) // BODY_FRAMES)])])
+
+
 def scene_start(
     start: SceneStart,
     capture: TrainingCapture,
@@ -209,9 +220,12 @@ def scene_start(
         camera, picture = backdrop.camera, backdrop.picture
         beyond = margins(camera)
         wide = camera.widened(*beyond)
-        depth = backdrop_depth(
-            wide, posed(track, frames), up=up_axis(track), margin=backdrop.margin
-        )
+        if backdrop.room is not None:
+            depth = backdrop.room.depth(wide)
+        else:
+            depth = backdrop_depth(
+                wide, posed(track, frames), up=up_axis(track), margin=backdrop.margin
+            )
         if backdrop.depth_shares is not None:
             sides = beyond[0], beyond[0], beyond[1], beyond[1]
             depth = depth * pad(backdrop.depth_shares[None], sides, mode="replicate")[0]

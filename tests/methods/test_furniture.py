@@ -1,0 +1,47 @@
+"""Furniture of a known room: a crate before the wall is as near as it is, and nothing else is."""
+
+import numpy as np
+import pytest
+
+from evsplat.methods.furniture import furnished
+
+from .rooms import HEIGHT_M, Crate, camera_over, met, painted, pillar, room_of
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_crate_is_nearer_than_the_wall_behind_it(seed, roll):
+    rng = np.random.default_rng(seed)
+    room = room_of(5.0, 3.0, 3.0, feet=(0.3, 2.5))
+    left, front = rng.uniform(-1.2, -0.6), rng.uniform(3.6, 4.2)
+    crate = Crate((left, front, -HEIGHT_M), (left + 0.8, front + 0.7, rng.uniform(-0.7, -0.4)))
+    camera = camera_over(rng.uniform(-0.2, 0.1), 0.15, roll)
+    shares = furnished(camera, painted(room, camera, rng, crate), room, pillar(0.3, 2.5))
+    which, depth = met(room, camera, crate)
+    there = which == len(room.normals)
+    bare = room.depth(camera)
+    # Of its upper end half the way to the wall is taken, which a seat has and a crate has not.
+    wrong = (shares * bare / depth - 1).abs()
+    assert (bare / depth - 1)[there].median() > 0.1
+    assert wrong[there].median() < 0.06
+    assert (shares[~there] == 1).float().mean() > 0.97
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_stands_in_an_empty_room(seed):
+    rng = np.random.default_rng(seed)
+    room, camera = room_of(5.0, 3.0, 3.0), camera_over(rng.uniform(-0.4, 0.4), 0.15)
+    shares = furnished(camera, painted(room, camera, rng), room, pillar(0, 2))
+    assert (shares == 1).float().mean() > 0.95
+
+
+def test_nothing_stands_before_the_person():
+    rng = np.random.default_rng(0)
+    room, camera = room_of(5.0, 3.0, 3.0), camera_over(0.0, 0.15)
+    crate = Crate((-0.5, 3.0, -HEIGHT_M), (0.5, 3.4, -0.5))
+    body = pillar(0.0, 3.8)
+    shares = furnished(camera, painted(room, camera, rng, crate), room, body)
+    pixels, depth = camera.project(body)
+    x, y = pixels.long().unbind(-1)
+    assert (shares < 1).any()
+    assert (shares[y, x] * room.depth(camera)[y, x] > depth).all()
