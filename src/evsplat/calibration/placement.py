@@ -21,6 +21,8 @@ from evsplat.spread import evenly_spread
 
 SURE = 0.5
 """Frames and events correlate so well or better at their place, else it is not told."""
+_BEYOND_DOUBT = 0.75
+"""Events that correlate so well are not looked for in a mirror, where much may look alike."""
 LEAST_GAIN = 0.03
 """Of the correlation at the place found, what is missing where they are given."""
 LEAST_PX = 0.6
@@ -123,7 +125,7 @@ def estimate_placement(pairs: Sequence[FramePair], events: EventSource) -> Place
         return None
     coarse = range(1, len(lags), 2)
     found = _best(frames, told, (0, 0), coarse)
-    if found[0] < SURE:
+    if found[0] < _BEYOND_DOUBT:
         ways = ((1, 0), (0, 1), (1, 1))
         mirrored = [_best(frames, told, flips, coarse) for flips in ways]
         found = max((found, *mirrored), key=lambda one: one[0])
