@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 
-from evsplat.methods.furniture import furnished
+from evsplat.methods.furniture import behind_things, furnished
 
 from .rooms import HEIGHT_M, Crate, camera_over, met, painted, pillar, room_of
 
@@ -45,3 +46,22 @@ def test_nothing_stands_before_the_person():
     x, y = pixels.long().unbind(-1)
     assert (shares < 1).any()
     assert (shares[y, x] * room.depth(camera)[y, x] > depth).all()
+
+
+def test_floor_and_walls_go_on_behind_things():
+    room, camera = room_of(5.0, 3.0, 3.0), camera_over(0.1, 0.15)
+    depth, shares = room.depth(camera), torch.ones(camera.height, camera.width)
+    shares[40:90, 30:71] = 0.8
+    shade = torch.linspace(0.2, 0.6, camera.width).expand(camera.height, -1)
+    picture = shade[..., None].repeat(1, 1, 3)
+    picture[39:91, 29:72] = torch.tensor([1.0, 0.0, 0.0])
+    places, scales, colours = behind_things(camera, picture, depth, shares)
+    pixels, away = camera.project(places)
+    x, y = pixels.long().unbind(-1)
+    assert torch.allclose(away, depth[y, x], rtol=1e-4)
+    drawn = torch.zeros_like(shares)
+    drawn[y, x] = 1
+    assert (torch.nn.functional.max_pool2d(drawn[None], 3, 1, 1)[0] > 0)[shares < 1].all()
+    assert not drawn[:30].any() and not drawn[:, 80:].any()
+    assert (scales > away[:, None] / camera.K[0, 0]).all()
+    assert torch.allclose(colours, shade[y, x, None].expand(-1, 3), atol=0.08)

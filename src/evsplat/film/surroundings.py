@@ -37,8 +37,8 @@ _FLOOR, _HORIZON, _TOP = (0.60, 0.58, 0.56), (0.83, 0.83, 0.82), (0.66, 0.69, 0.
 _FLOOR_ENDS_M = 5.0
 _SHADOW, _SHADOW_M = 0.4, 0.4
 """Depth and standard deviation of the soft spot below the person."""
-_CLEAR_M = (0.45, 0.15)
-"""What is nearer to the camera than the person's nearest point by these begins and ends to fade."""
+_CLEAR_M = (0.3, 0.0)
+"""What is nearer to the camera than the person's middle by these has faded and begins to fade."""
 _COARSE_PX = 64
 """Side of the pictures in a hurry, at least: with less the horizon and the spot are steps."""
 _BEHIND, _WALL = 1.05, 0.97
@@ -96,8 +96,8 @@ class Room:
         scene, human = layers.scene, layers.human
         if not human.means.numel():
             return layers
-        depth, nearest = (camera.project(part.means)[1] for part in (scene, human))
-        begin, end = (nearest.min() - metres for metres in _CLEAR_M)
+        depth, person = (camera.project(part.means)[1] for part in (scene, human))
+        begin, end = (person.mean() - metres for metres in _CLEAR_M)
         share = eased((depth[0] - begin) / (end - begin))
         height = scene.means[0] @ self.up.to(scene.means) - self.floor_m
         share = torch.where(height < FLOOR_M, 1.0, share)

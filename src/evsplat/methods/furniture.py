@@ -10,12 +10,13 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_opening, gaussian_filter, label, maximum_filter
+from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, label, maximum_filter
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from evsplat.camera import Camera
 from evsplat.gaussians.initialise import pixel_rays
+from evsplat.methods.background import gone_on
 from evsplat.methods.colour_shares import ColourShares
 from evsplat.methods.plane_sweep import enlarged, pooled
 from evsplat.methods.room import Room, from_feet_m
@@ -36,6 +37,9 @@ _LEAST_PX = 20
 _CLEARANCE, _BODY_PX = 1.03, 7
 """Least depth of a thing as a share of the body's, and the square over which one of its points
 counts."""
+_RIM_PX, _CELL_PX, _WIDTH = 2, 2, 0.75
+"""Width of a thing's rim, whose colours are in part its own; side of the squares of what is behind
+it, of which each has a Gaussian, and its standard deviation in them."""
 _GAP, _LEAST_ROWS = 3, 4
 """Rows without it that a thing may have, and that it must have."""
 _LEADS_BACK = 0.5
@@ -56,6 +60,27 @@ def furnished(
     least = _CLEARANCE * _farthest_m(body, view) / room.depth(view)
     shares = torch.maximum(shares, least).clamp_max(1)
     return enlarged(shares, step)[: camera.height, : camera.width]
+
+
+def behind_things(
+    camera: Camera,
+    picture: Float[Tensor, "H W 3"],
+    depth: Float[Tensor, "H W"],
+    shares: Float[Tensor, "H W"],
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Places, scales and colours of floor and walls behind things, which a camera beside sees.
+
+    ``depth``: of floor and walls, metres; ``shares``: see `furnished`. Colours, sRGB, go on from
+    around the things.
+    """
+    things = torch.from_numpy(binary_dilation((shares < 1).numpy(), iterations=_RIM_PX))
+    goes_on = gone_on(picture, ~things)
+    cells = things[::_CELL_PX, ::_CELL_PX].nonzero() * _CELL_PX
+    y, x = cells.unbind(-1)
+    away = depth[y, x, None]
+    places = camera.center() + away * pixel_rays(camera)[y, x]
+    scales = (_WIDTH * _CELL_PX * away / camera.K[0, 0]).repeat(1, 3)
+    return places, scales, goes_on[y, x]
 
 
 def _farthest_m(body: Float[Tensor, "N 3"], view: Camera) -> Float[Tensor, "H W"]:

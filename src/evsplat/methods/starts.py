@@ -24,6 +24,7 @@ from evsplat.gaussians.initialise import (
     random_cube,
 )
 from evsplat.gaussians.surround import margins, surround
+from evsplat.methods.furniture import behind_things
 from evsplat.methods.room import Room
 from evsplat.ranges import Above, AtLeast, ReadIf
 
@@ -210,7 +211,7 @@ def scene_start(
     ``goes_on``: a backdrop goes on beyond the borders of the recorded picture.
     """
     frames = capture.train_frames
-    around: dict[str, Tensor] = {}
+    around: list[dict[str, Tensor]] = []
     if start.kind == "random_cube":
         points, colours = random_cube(*cube(start, capture, track), start.cube_count, generator)
         scales = nearest_spacing(points)[:, None].repeat(1, 3)
@@ -238,7 +239,20 @@ def scene_start(
         )
         opacity = BACKDROP_OPACITY
         if goes_on:
-            around = surround(wide, picture, depth, semantic_logit, feature_dim)
+            around = [surround(wide, picture, depth, semantic_logit, feature_dim)]
+        if backdrop.room is not None and backdrop.depth_shares is not None:
+            behind = behind_things(
+                camera, picture, backdrop.room.depth(camera), backdrop.depth_shares
+            )
+            around.append(
+                gaussians_at(
+                    *behind[:2],
+                    opacity=opacity,
+                    semantic_logit=semantic_logit,
+                    rgb_srgb=behind[2],
+                    feature_dim=feature_dim,
+                )
+            )
     values = gaussians_at(
         points,
         scales,
@@ -248,8 +262,7 @@ def scene_start(
         feature_dim=feature_dim,
     )
     return {
-        name: torch.cat([value, around[name]]) if around else value
-        for name, value in values.items()
+        name: torch.cat([value, *(each[name] for each in around)]) for name, value in values.items()
     }, colours
 
 

@@ -5,7 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from evsplat.camera import Camera
 from evsplat.capture import Policy, load_capture
+from evsplat.gaussians import GaussianSet
+from evsplat.gaussians.initialise import gaussians_at, pixel_rays
 from evsplat.gaussians.surround import cell_px, continued
 from evsplat.models.discs.outskirts import outskirts
 from evsplat.models.discs.still import Still
@@ -170,3 +173,33 @@ def test_what_a_picture_that_is_not_drawn_shows_is_no_outside(tiny_capture, monk
     )
     assert not torch.equal(alone[shown], own[shown])
     assert torch.equal(found[shown], own[shown])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_thing_hides_is_as_the_wall_beside_it(seed):
+    """A thing of half the distance before the left half of a wall, whose hidden part is noise."""
+    K = torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
+    camera = Camera(64, 64, K, torch.eye(4))
+    rays = pixel_rays(camera)
+    left = rays[:, :30].reshape(-1, 3)
+    points = torch.cat([4 * rays.reshape(-1, 3), 2 * left])
+    colours = torch.tensor([0.2, 0.3, 0.6]).repeat(len(points), 1)
+    colours[-len(left) :] = torch.tensor([0.8, 0.2, 0.2])
+    hidden = torch.zeros(64, 64, dtype=torch.bool)
+    hidden[4:-4, 4:24] = True
+    rows = hidden.flatten().nonzero()[:, 0]
+    noise = torch.rand(len(rows), 3, generator=torch.Generator().manual_seed(seed))
+    wall = colours[rows[0]].clone()
+    colours[rows] = noise
+    scales = (0.8 * points[:, 2:] / 64).repeat(1, 3)
+    scene = gaussians_at(
+        points, scales, opacity=0.98, semantic_logit=-4.0, rgb_srgb=colours, feature_dim=None
+    )
+    nobody = {name: value[:0] for name, value in scene.items()}
+    gaussians = GaussianSet(nobody, scene)
+    found = outskirts(gaussians, [camera], 0.1)
+    assert (noise - wall).abs().mean() > 0.2
+    assert (found[rows] - wall).abs().mean() < 0.03
+    shown = fixed(Still.of(gaussians, None, hard_semantics=True).scene.with_times(), colours[None])
+    before, after = (drawn(shown, rgb, camera, 0.1) for rgb in (colours, found))
+    assert (before - after).abs().max() < 0.01

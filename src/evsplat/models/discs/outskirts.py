@@ -10,7 +10,7 @@ from functools import partial, reduce
 from operator import add
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from evsplat.camera import Camera
@@ -20,6 +20,7 @@ from evsplat.gaussians.surround import cell_px, continued
 from evsplat.models.discs.first_colours import LEAST, MOST
 from evsplat.models.discs.still import Still
 from evsplat.models.seen import fixed, shares_by, transposed
+from evsplat.neighbours import nearest
 from evsplat.render import Splats, render
 
 MOST_VIEWS = 12
@@ -32,12 +33,19 @@ _BEYOND, _RIM = 0.25, 2.0
 """Cells beyond a border from which on a Gaussian is outside, and up to which from the border inside
 colours may make up for what is missed of those."""
 _FAST = 1e6
+_HIDDEN, _SEEN, _AROUND = 0.02, 0.1, 16
+"""Squared shares of pixels below which a Gaussian within a picture is hidden, and from which it is
+seen; and of how many that are seen a hidden one has the mean colour."""
+_FARTHER = 1.15
+"""Its least depth as a share of the picture's there."""
 
 
 def outskirts(
     gaussians: GaussianSet, recorded: Sequence[Camera], low_pass: float
 ) -> Float[Tensor, "S 3"]:
     """The scene's own colours, sRGB; outside of all recorded pictures as the nearest one's rim.
+
+    Behind furniture they are as what is seen about it.
 
     Those closest to that with which the pictures of the scene alone look as before (`closest`).
     What lies within any of them is changed by as little as that takes, and only near its border.
@@ -59,19 +67,37 @@ def outskirts(
     cell = cell_px(views[0].width, views[0].height)
     least = torch.stack([_cells_beyond(scene, camera, cell) for camera in recorded]).amin(0)
     outside, near = least > _BEYOND, least > -_RIM
-    nearest = torch.stack([_cells_beyond(scene, view, cell) for view in views]).argmin(0)
+    closest_view = torch.stack([_cells_beyond(scene, view, cell) for view in views]).argmin(0)
     told = own.clone()
     for index, (view, picture) in enumerate(zip(views, before, strict=True)):
-        rows = outside & (nearest == index)
+        rows = outside & (closest_view == index)
         places = view.project(scene.means[0])[0]
         told[rows] = continued(picture[0].cpu(), places[rows].cpu(), cell).to(own.device)
-    missing = _over(pictures, told, lambda drawn, index: before[index] - drawn)
     generator = torch.Generator().manual_seed(0)
     shares = [shares_by(draw, scene.means, generator) for draw in pictures]
-    price = torch.where(near, PRICE * cell**2, _FAST).to(own)
     squares = reduce(add, [each[:, 1:].square().mean(1) for each in shares])
+    hidden = ~near & (squares < _HIDDEN) & _behind(scene, views[0], pictures[0])
+    shown = ~outside & (squares > _SEEN)
+    if len(views) == 1 and hidden.any() and shown.sum() >= _AROUND:
+        points = scene.means[0]
+        _, around = nearest(points[shown], _AROUND, points[hidden])
+        told[hidden] = own[shown][around].mean(1)
+        near = near | hidden
+    missing = _over(pictures, told, lambda drawn, index: before[index] - drawn)
+    price = torch.where(near, PRICE * cell**2, _FAST).to(own)
     colours = closest(told, missing, seen, squares, price, torch.zeros_like(price), STEPS)
     return torch.where(near[:, None], colours.clamp(LEAST, MOST), own)
+
+
+def _behind(scene: Splats, view: Camera, draw: Callable[[Tensor], Tensor]) -> Bool[Tensor, " S"]:
+    """What lies well behind the depth that the picture has there."""
+    places, depth = view.project(scene.means[0])
+    with torch.no_grad():
+        sums = draw(torch.stack([depth, torch.ones_like(depth), depth], -1)[None])[0]
+    x, y = places.floor().long().unbind(-1)
+    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+    at = sums[y.clamp(0, view.height - 1), x.clamp(0, view.width - 1)]
+    return inside & (depth * at[:, 1] > _FARTHER * at[:, 0])
 
 
 def _drawn(
