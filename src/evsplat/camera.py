@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from evsplat.devices import send
@@ -72,6 +72,18 @@ class Camera:
         depth = in_camera[..., 2]
         homogeneous = in_camera @ self.K.to(points).T
         return homogeneous[..., :2] / depth[..., None], depth
+
+    def pixels(
+        self, points: Float[Tensor, "*N 3"]
+    ) -> tuple[Int[Tensor, "*N"], Int[Tensor, "*N"], Float[Tensor, "*N"], Bool[Tensor, "*N"]]:
+        """Column and row of the pixel that shows each point, its depth, and whether one does.
+
+        Where none does, column and row are of the nearest one along the border.
+        """
+        places, depth = self.project(points)
+        x, y = places.floor().long().unbind(-1)
+        column, row = x.clamp(0, self.width - 1), y.clamp(0, self.height - 1)
+        return column, row, depth, (depth > 0) & (x == column) & (y == row)
 
 
 def distinct(cameras: Sequence[Camera]) -> tuple[Camera, ...]:

@@ -138,3 +138,19 @@ def test_a_widened_camera_has_its_picture_in_the_middle() -> None:
     points = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
     moved = wide.project(points)[0] - camera.project(points)[0]
     assert torch.allclose(moved, torch.tensor([7.0, 11.0]), atol=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_point_is_shown_by_the_pixel_around_its_place(seed: int) -> None:
+    camera = random_camera(seed)
+    points = torch.from_numpy(np.random.default_rng(seed).normal(size=(40, 50, 3)) * 4).float()
+    x, y, depth, shown = camera.pixels(points)
+    places, away = camera.project(points)
+    assert torch.equal(depth, away) and 0 < shown.sum() < shown.numel()
+    inside = (places >= 0).all(-1) & (places[..., 0] < WIDTH) & (places[..., 1] < HEIGHT)
+    assert torch.equal(shown, inside & (away > 0))
+    assert (
+        int(x.min()) >= 0 and int(x.max()) < WIDTH and int(y.min()) >= 0 and int(y.max()) < HEIGHT
+    )
+    middles = torch.stack([x, y], -1)[shown] + 0.5
+    assert (places[shown] - middles).abs().max() <= 0.5 + 1e-4

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, label, maximum_filter
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from evsplat.camera import Camera
 from evsplat.gaussians.initialise import pixel_rays
 from evsplat.methods.background import gone_on
 from evsplat.methods.colour_shares import ColourShares
+from evsplat.methods.line_directions import level_axes
 from evsplat.methods.plane_sweep import enlarged, pooled
 from evsplat.methods.room import Room, from_feet_m
 
@@ -85,9 +85,7 @@ def behind_things(
 
 def _farthest_m(body: Float[Tensor, "N 3"], view: Camera) -> Float[Tensor, "H W"]:
     """Depth of the farthest of the body's points about each pixel; 0 where it never was."""
-    pixels, depth = view.project(body)
-    x, y = pixels.floor().long().unbind(-1)
-    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+    x, y, depth, inside = view.pixels(body)
     farthest = torch.zeros(view.height * view.width)
     at = (y * view.width + x)[inside]
     farthest.scatter_reduce_(0, at, depth[inside].float(), "amax")
@@ -162,9 +160,8 @@ def _shares(things: Bool[np.ndarray, "H W"], view: Camera, room: Room) -> Float[
     Of columns and rows of equal azimuth and of equal slope, in which what is upright stays in its
     column, however the camera is held.
     """
-    rays, looks, up = pixel_rays(view), view.world_to_camera[2, :3], room.up
-    ahead = normalize(looks - (looks @ up) * up, dim=0)
-    right = torch.linalg.cross(ahead, up)
+    rays, up = pixel_rays(view), room.up
+    right, ahead = level_axes(view, up, 0.0)
     azimuths = torch.atan2(rays @ right, rays @ ahead)
     slopes = -(rays @ up) / torch.hypot(rays @ right, rays @ ahead)
     columns, column = _cells(azimuths, things.shape[1])
@@ -173,12 +170,8 @@ def _shares(things: Bool[np.ndarray, "H W"], view: Camera, room: Room) -> Float[
     directions = level - rows[:, None, None] * up
     inverse = room.inverse(view.center(), directions)
     nearest = inverse.amax(-1)
-    shown, ahead_of = view.project(view.center() + directions)
-    x, y = shown.floor().long().unbind(-1)
-    inside = (ahead_of > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
-    there = (
-        torch.from_numpy(things)[y.clamp(0, view.height - 1), x.clamp(0, view.width - 1)] & inside
-    )
+    x, y, _, inside = view.pixels(view.center() + directions)
+    there = torch.from_numpy(things)[y, x] & inside
     shares = torch.ones_like(nearest)
     for at in range(len(columns)):
         for top, foot in _runs(there[:, at].numpy()):

@@ -62,17 +62,16 @@ _NO_WAY = 0.2
 """Weight with which an edge has none of the three directions."""
 
 _ALONG, _AHEAD, _UP = range(3)
-_BETWEEN = np.zeros((4, 4), int)
+_NONE = -1
+_BETWEEN = np.array(
+    [
+        [_NONE, _ALONG, _AHEAD, _AHEAD],
+        [_ALONG, _NONE, _UP, _UP],
+        [_AHEAD, _UP, _NONE, _UP],
+        [_AHEAD, _UP, _UP, _NONE],
+    ]
+)
 """Direction of the crease between two of floor and walls ahead, left and right."""
-for _one, _other, _direction in (
-    (0, 1, _ALONG),
-    (0, 2, _AHEAD),
-    (0, 3, _AHEAD),
-    (1, 2, _UP),
-    (1, 3, _UP),
-    (2, 3, _UP),
-):
-    _BETWEEN[_one, _other] = _BETWEEN[_other, _one] = _direction
 
 
 @dataclass(frozen=True, eq=False)

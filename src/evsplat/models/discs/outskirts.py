@@ -76,9 +76,10 @@ def outskirts(
     generator = torch.Generator().manual_seed(0)
     shares = [shares_by(draw, scene.means, generator) for draw in pictures]
     squares = reduce(add, [each[:, 1:].square().mean(1) for each in shares])
-    hidden = ~near & (squares < _HIDDEN) & _behind(scene, views[0], pictures[0])
     shown = ~outside & (squares > _SEEN)
-    if len(views) == 1 and hidden.any() and shown.sum() >= _AROUND:
+    # What one of several views hides another may show.
+    if len(views) == 1 and shown.sum() >= _AROUND:
+        hidden = ~near & (squares < _HIDDEN) & _behind(scene, views[0], pictures[0])
         points = scene.means[0]
         _, around = nearest(points[shown], _AROUND, points[hidden])
         told[hidden] = own[shown][around].mean(1)
@@ -91,13 +92,11 @@ def outskirts(
 
 def _behind(scene: Splats, view: Camera, draw: Callable[[Tensor], Tensor]) -> Bool[Tensor, " S"]:
     """What lies well behind the depth that the picture has there."""
-    places, depth = view.project(scene.means[0])
+    x, y, depth, inside = view.pixels(scene.means[0])
     with torch.no_grad():
-        sums = draw(torch.stack([depth, torch.ones_like(depth), depth], -1)[None])[0]
-    x, y = places.floor().long().unbind(-1)
-    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
-    at = sums[y.clamp(0, view.height - 1), x.clamp(0, view.width - 1)]
-    return inside & (depth * at[:, 1] > _FARTHER * at[:, 0])
+        sums = draw(torch.stack([depth, torch.ones_like(depth)], -1)[None])[0]
+    depths, shares = sums[y, x].unbind(-1)
+    return inside & (depth * shares > _FARTHER * depths)
 
 
 def _drawn(
