@@ -20,7 +20,7 @@ from evsplat.film.following import (
     whole_turn,
 )
 from evsplat.film.motion import load_motion_of
-from evsplat.film.surroundings import Painted, Room
+from evsplat.film.surroundings import CalmRoom, Painted
 from evsplat.gaussians.initialise import pixel_rays
 from evsplat.models.layers import Layers
 from evsplat.pictures.files import write_image
@@ -85,7 +85,7 @@ def test_a_camera_from_which_somebody_walks_away_is_told(recorded):
 
 
 def test_the_empty_room_has_a_floor_below_the_feet_and_no_black(recorded):
-    room = Room.of(recorded, recorded)
+    room = CalmRoom.of(recorded, recorded)
     lowest = min(float(recorded.vertices(int(t))[:, 2].min()) for t in recorded.times_us)
     assert room.floor_m == pytest.approx(lowest, abs=1e-3)
     camera = camera_before(recorded, away=4.0)
@@ -113,7 +113,7 @@ def splats(means: torch.Tensor) -> Splats:
 
 
 def test_what_stands_before_the_person_fades_but_the_floor_and_what_is_behind(recorded):
-    room = Room.of(recorded, recorded)
+    room = CalmRoom.of(recorded, recorded)
     camera = camera_before(recorded, away=4.0)
     person = recorded.vertices(0)[None]
     middle, center = person.mean(1)[0], camera.center()
@@ -179,7 +179,7 @@ def test_a_background_of_32_bits_is_refused(tmp_path):
 
 def test_a_wall_stands_behind_all_that_the_filmed_person_does_and_looks_the_same(recorded):
     camera = camera_before(recorded, away=4.0)
-    room = Room.of(recorded, recorded, camera)
+    room = CalmRoom.of(recorded, recorded, camera)
     times = recorded.times_us.tolist()
     deepest = max(float(camera.project(recorded.vertices(t))[1].max()) for t in times)
     rays, center = pixel_rays(camera), camera.center()
@@ -200,12 +200,12 @@ def test_a_wall_stands_behind_all_that_the_filmed_person_does_and_looks_the_same
     torch.testing.assert_close(
         scene.scales[0, :, 0] / depth, torch.full_like(depth, 0.01) / depth_before
     )
-    assert Room.of(recorded, recorded).stand_back(layers, camera) is layers
+    assert CalmRoom.of(recorded, recorded).stand_back(layers, camera) is layers
 
 
 def test_a_person_alone_and_a_scene_alone_are_filmed_as_they_are(recorded):
     camera = camera_before(recorded, away=4.0)
-    room = Room.of(recorded, recorded, camera)
+    room = CalmRoom.of(recorded, recorded, camera)
     some, none = splats(recorded.vertices(0)[None]), splats(torch.zeros(1, 0, 3))
     for human, scene in ((some, none), (none, some)):
         layers = Layers(human, scene, torch.eye(4)[None])
@@ -217,7 +217,7 @@ def test_a_person_alone_and_a_scene_alone_are_filmed_as_they_are(recorded):
 
 def test_the_rim_of_what_was_recorded_fades_as_the_camera_goes_away(recorded):
     camera = camera_before(recorded, away=4.0)
-    room = Room.of(recorded, recorded, camera)
+    room = CalmRoom.of(recorded, recorded, camera)
     rays = pixel_rays(camera)
     middle, rim = rays[32, 48], rays[32, 0]
     outside = rays[32, 0] + 0.2 * (rays[32, 0] - rays[32, 1]) * camera.width
@@ -237,4 +237,4 @@ def test_the_rim_of_what_was_recorded_fades_as_the_camera_goes_away(recorded):
     halfway = camera_before(recorded, away=4.0)
     halfway.world_to_camera[:3, 3] -= halfway.world_to_camera[:3, :3] @ (0.15 * step)
     assert float(room.soften(layers, halfway).scene.opacities[2]) == pytest.approx(0.45)
-    assert Room.of(recorded, recorded).soften(layers, aside) is layers
+    assert CalmRoom.of(recorded, recorded).soften(layers, aside) is layers

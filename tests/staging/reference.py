@@ -6,11 +6,11 @@ from evsplat.capture import Camera
 from evsplat.staging import room as lights
 from evsplat.staging.character import Character
 from evsplat.staging.renderer import STILL_SAMPLES
-from evsplat.staging.room import Lighting, Room
+from evsplat.staging.room import Lighting, RoomMesh
 
 
 def draw(
-    room: Room,
+    room: RoomMesh,
     character: Character,
     light: Lighting,
     camera: Camera,

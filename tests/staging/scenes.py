@@ -6,7 +6,7 @@ import torch
 from evsplat.body import default_body
 from evsplat.capture import Camera
 from evsplat.staging.character import Character
-from evsplat.staging.room import Lighting, Room
+from evsplat.staging.room import Lighting, RoomMesh
 
 WHITE = np.full((1, 16, 16, 3), 255, np.uint8)
 LAMP = (0.0, 0.0, 2.6, 0.5, 0.5)
@@ -40,13 +40,13 @@ def make_room(
     tint: np.ndarray | float = 1.0,
     direct: np.ndarray | float = 0.0,
     ambient: np.ndarray | float = 1.0,
-) -> Room:
+) -> RoomMesh:
     """Triangles (F, 3, 3) in even light."""
     corners = np.asarray(corners, np.float32)
     count = len(corners)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Room(
+    return RoomMesh(
         corners=corners,
         normals=normals.astype(np.float32),
         uv=np.zeros((count, 3, 2), np.float32) if uv is None else uv.astype(np.float32),

@@ -13,7 +13,7 @@ import torch
 from evsplat.capture import load_capture
 from evsplat.errors import DataError
 from evsplat.film import Look
-from evsplat.film.surroundings import Room
+from evsplat.film.surroundings import CalmRoom
 from evsplat.training.reconstruction import GaussianReconstruction
 from evsplat.training.run import Run
 from evsplat.training_sign import training_in
@@ -134,7 +134,7 @@ def test_from_elsewhere_holes_show_a_room_and_the_rest_what_films_show(run):
     assert empty.min() > 0.2
     track = run.reconstruction.track
     recording = camera if run.capture.is_static_camera else None
-    room = Room.of(track, track, recording)
+    room = CalmRoom.of(track, track, recording)
     assert np.abs(empty - room.behind(away, time_us).numpy()).max() < 0.05
     drawn = run.reconstruction.changed_by(room.clear, room.soften)
     drawn = replace(drawn, backdrop=None)

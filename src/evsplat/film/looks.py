@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt16
 
 from evsplat.camera import Camera
 from evsplat.errors import ConfigError
-from evsplat.film.surroundings import Painted, Room
+from evsplat.film.surroundings import CalmRoom, Painted
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
 from evsplat.pictures import Transfer, decode, encode, luminance, shown
@@ -36,7 +36,7 @@ class Look:
     """RGBA instead of black where nothing is; for ``rgb`` and ``semantic``."""
     transfer: Transfer = "power"
     """From the values that are drawn to light."""
-    surroundings: Room | Painted | None = field(default=None, repr=False)
+    surroundings: CalmRoom | Painted | None = field(default=None, repr=False)
     """What shows of ``rgb`` where nothing is; black without. It follows from run and film."""
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ from evsplat.film.camera_path import CameraPath, interpolated, read_camera_path
 from evsplat.film.following import follow, in_view, straight, to_both_sides, whole_turn
 from evsplat.film.frame_cache import FilmFrame
 from evsplat.film.motion import load_motion_of
-from evsplat.film.surroundings import Painted, Room
+from evsplat.film.surroundings import CalmRoom, Painted
 from evsplat.options import Film
 from evsplat.training.reconstruction import GaussianReconstruction
 
@@ -37,7 +37,7 @@ class FilmPlan:
     """Distance of the person from the first camera, metres."""
     from_files: tuple[object, ...]
     """Times and poses of a motion and pixels of a background, for the film's digest."""
-    surroundings: Room | Painted | None
+    surroundings: CalmRoom | Painted | None
     """What shows where nothing is."""
 
     @classmethod
@@ -72,7 +72,7 @@ class FilmPlan:
         # It may be another than the one that the film is seen by, which recorded nothing.
         recorder = capture.camera_at(recording, times[0]) if capture.is_static_camera else None
         # Up is where people stood in the recording: a motion may be a somersault.
-        room = Room.of(recorded, track, recorder)
+        room = CalmRoom.of(recorded, track, recorder)
         surroundings = _surroundings(film, room)
         if isinstance(surroundings, Painted):
             from_files += (surroundings.picture.numpy(),)
@@ -194,7 +194,7 @@ def _of_height(cameras: list[Camera], height: int | None) -> list[Camera]:
     return [made[id(camera)] for camera in cameras]
 
 
-def _surroundings(film: Film, room: Room) -> Room | Painted | None:
+def _surroundings(film: Film, room: CalmRoom) -> CalmRoom | Painted | None:
     if film.background is not None:
         return Painted.of(film.background)
     plain = film.show != "rgb" or film.parts != "all" or film.transparent or film.what == "test"

@@ -50,7 +50,7 @@ _ELSEWHERE = (0.3, 0.15)
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class CalmRoom:
     """An even gradient above a soft floor, and the person's soft spot on it."""
 
     track: BodyTrack
@@ -62,7 +62,9 @@ class Room:
     """The camera that recorded the scene, where it stood still."""
 
     @classmethod
-    def of(cls, recorded: BodyTrack, filmed: BodyTrack, recording: Camera | None = None) -> "Room":
+    def of(
+        cls, recorded: BodyTrack, filmed: BodyTrack, recording: Camera | None = None
+    ) -> "CalmRoom":
         """The floor is where the recorded person's lowest point is."""
         up = up_axis(recorded).float().cpu()
         return cls(filmed, up, lowest_m(recorded, up), recording)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from evsplat.staging.camera import MAIN, TARGET, look_at
-from evsplat.staging.room import Lighting, Room
+from evsplat.staging.room import Lighting, RoomMesh
 
 ROOM_STRENGTH = 1.4
 """Light of the lamp on the room against that on the person, as the room that ships was baked."""
@@ -34,7 +34,7 @@ def azimuth_and_elevation(place: tuple[float, ...]) -> tuple[float, float]:
     return float((turn + 180) % 360 - 180), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
-def lamp_at(room: Room, azimuth_deg: float | None, elevation_deg: float | None) -> Lighting:
+def lamp_at(room: RoomMesh, azimuth_deg: float | None, elevation_deg: float | None) -> Lighting:
     """The room's lamp hung elsewhere, as far from the person's middle, which it shines at.
 
     There it is as bright as where the room has it. Angles as in `azimuth_and_elevation`, each the
@@ -57,7 +57,7 @@ def lamp_at(room: Room, azimuth_deg: float | None, elevation_deg: float | None) 
     return replace(light, lamp_strength=strength, shadow_way=light.facing)
 
 
-def in_light_of(room: Room, light: Lighting) -> Room:
+def in_light_of(room: RoomMesh, light: Lighting) -> RoomMesh:
     """The room with its direct light baked anew, furniture's shadows included.
 
     Light from elsewhere stays as it was baked.
@@ -91,7 +91,7 @@ def _points(light: Lighting) -> Float[np.ndarray, "P 3"]:
     return centre + (grid * light.lamp[3:]) @ sides
 
 
-def _stands(room: Room) -> Bool[np.ndarray, "F"]:
+def _stands(room: RoomMesh) -> Bool[np.ndarray, "F"]:
     """True for triangles that stand off floor, ceiling and walls."""
     low, high = room.corners.min((0, 1)) + _SHELL_M, room.corners.max((0, 1)) - _SHELL_M
     outside = (room.corners < low) | (room.corners > high)

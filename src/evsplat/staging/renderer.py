@@ -9,7 +9,7 @@ from evsplat.body.skeleton import find_skeleton
 from evsplat.camera import Camera
 from evsplat.compiled import native_for
 from evsplat.staging.character import Character
-from evsplat.staging.room import Lighting, Room
+from evsplat.staging.room import Lighting, RoomMesh
 
 STILL_SAMPLES = 4
 """Samples of the room per pixel and axis where the camera stands still: drawn once, kept."""
@@ -28,7 +28,7 @@ class StageRenderer:
 
     def __init__(
         self,
-        room: Room,
+        room: RoomMesh,
         character: Character,
         lighting: Lighting | None = None,
         *,

@@ -71,7 +71,7 @@ class Lighting:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class RoomMesh:
     """Surfaces and the light that falls on them; metres, z up, the floor at z = 0."""
 
     corners: Float32[np.ndarray, "F 3 3"]
@@ -92,7 +92,7 @@ class Room:
     """Centre of the ceiling lamp and half its extent along x and y."""
 
 
-def load_room() -> Room:
+def load_room() -> RoomMesh:
     """The room that ships with evsplat."""
     folder = files("evsplat") / "data" / "stage"
     with as_file(folder / "room.npz") as path:
@@ -101,7 +101,7 @@ def load_room() -> Room:
         strip = read_rgba(path)[..., :3]
     side = strip.shape[1]
     triangles = _decode(arrays)
-    return Room(
+    return RoomMesh(
         **triangles,
         layer=arrays["layer"].astype(np.int32),
         textures=strip.reshape(-1, side, side, 3),

@@ -21,7 +21,7 @@ from evsplat.export.cloud import SplatCloud
 from evsplat.export.gaussians import cloud_at
 from evsplat.film import Look, load_motion_of
 from evsplat.film.looks import depth_colours
-from evsplat.film.surroundings import Room
+from evsplat.film.surroundings import CalmRoom
 from evsplat.methods.reconstruction import Parts
 from evsplat.pictures import Transfer
 from evsplat.render import Backdrop
@@ -46,7 +46,7 @@ class ViewedRun:
         self.name = name
         self.capture = run.capture
         self._motions: dict[str, BodyTrack] = {}
-        self._rooms: dict[str | None, Room] = {}
+        self._rooms: dict[str | None, CalmRoom] = {}
         self._clear_caches()
 
     def reload(self, state: Path) -> None:
@@ -116,7 +116,7 @@ class ViewedRun:
             frame = self.capture.frames[0]
             recording = self.capture.camera(frame) if self.capture.is_static_camera else None
             recorded = self.run.reconstruction.track.to("cpu")
-            room = Room.of(recorded, self.track(motion.name).to("cpu"), recording)
+            room = CalmRoom.of(recorded, self.track(motion.name).to("cpu"), recording)
             self._rooms[motion.name] = room
         shown = drawn.changed_by(room.clear, room.soften).render(camera, [time_us])
         holes = 1 - shown.alpha[0].cpu().clamp(0, 1)[..., None]
