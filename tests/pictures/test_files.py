@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evsplat.errors import DataError
-from evsplat.pictures.files import read_image, to_unit_range
+from evsplat.pictures.files import holds_16_bits, read_image, to_unit_range
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -23,6 +23,7 @@ def test_a_tiff_keeps_its_depth_however_it_is_packed(
     assert cv2.imwrite(str(path), pixels[..., ::-1], [cv2.IMWRITE_TIFF_COMPRESSION, packing])
     read = read_image(path)
     assert read.dtype == pixels.dtype
+    assert holds_16_bits(path) == (kind == "u2")
     assert np.array_equal(read.reshape(pixels.shape), pixels)
 
 
@@ -40,6 +41,7 @@ def test_a_bitmap_with_16_bits_of_all_colours_reaches_black_and_white(
     (tmp_path / "p.bmp").write_bytes(head + header + words)
     read = read_image(tmp_path / "p.bmp")
     assert read.dtype == np.uint8
+    assert not holds_16_bits(tmp_path / "p.bmp")
     assert np.abs(read - levels * 255 / (31, 63, 31)).max() <= 1
 
 
@@ -58,8 +60,25 @@ def test_a_portable_map_keeps_its_depth_whatever_its_greatest_value(
     path.write_bytes(f"{magic[channels, plain]}\n7 5\n{most}\n".encode() + body)
     read = read_image(path)
     assert read.dtype == (np.uint16 if most > 255 else np.uint8)
+    assert holds_16_bits(path) == (most > 255)
     expected = levels / most * np.iinfo(read.dtype).max
     assert np.abs(read.reshape(levels.shape) - expected).max() <= 1
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_the_depth_of_a_png_is_told_without_its_pixels(
+    rng: np.random.Generator, tmp_path: Path, kind: str, channels: int
+) -> None:
+    pixels = rng.integers(0, np.iinfo(kind).max, (9, 14, channels), dtype=kind, endpoint=True)
+    path = tmp_path / "p.png"
+    assert cv2.imwrite(str(path), pixels)
+    assert holds_16_bits(path) == (read_image(path).dtype == np.uint16) == (kind == "u2")
+    content = path.read_bytes()
+    path.write_bytes(content[: content.index(b"IDAT") + 4])
+    with pytest.raises(DataError):
+        read_image(path)
+    assert holds_16_bits(path) == (kind == "u2")
 
 
 @pytest.mark.parametrize("kind", ["f4", "i4"])

@@ -22,7 +22,7 @@ from evsplat.capture.validate import check_capture
 from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import copy_file, make_folder, new_folder, remove_file, write_json
-from evsplat.pictures.files import read_image, write_image
+from evsplat.pictures.files import holds_16_bits, write_image
 from evsplat.untrusted.text import read_json
 
 Frames = Sequence[Frame]
@@ -172,8 +172,8 @@ def write_picture(path: Path, picture: Float[Tensor, "..."], *, like: Path | Non
     make_folder(path.parent)
     pixels = np.ascontiguousarray(picture.detach().cpu().numpy())
     # 8 bits of light leave a dark picture a handful of levels.
-    if like is not None and (kind := read_image(like).dtype) == np.uint16:
-        pixels = (pixels.clip(0, 1) * np.iinfo(kind).max + 0.5).astype(kind)
+    if like is not None and holds_16_bits(like):
+        pixels = (pixels.clip(0, 1) * np.iinfo(np.uint16).max + 0.5).astype(np.uint16)
     # It may be a hard link, and what it is linked to must stay.
     remove_file(path)
     write_image(path, pixels)

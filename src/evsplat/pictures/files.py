@@ -28,6 +28,11 @@ def read_image(path: Path) -> np.ndarray:
     return read_16_bit_colour(path) if pixels is None else pixels
 
 
+def holds_16_bits(path: Path) -> bool:
+    """Whether `read_image` gives uint16, by the header alone: no pixel is decoded."""
+    return read_picture(path, _is_16_bit)
+
+
 def read_opaque(path: Path) -> np.ndarray | None:
     """As `read_image`; None where the picture is transparent in places."""
 
@@ -154,6 +159,13 @@ def _pixels(path: Path, image: Image.Image) -> np.ndarray | None:
     if image.mode == "I;16B":
         return np.array(image).astype(np.uint16)
     return np.array(image.convert("L" if image.mode in ("1", "LA") else "RGB"))
+
+
+def _is_16_bit(image: Image.Image) -> bool:
+    """Of a picture that `_pixels` takes."""
+    if image.mode in ("RGB", "RGBA"):
+        return _has_16_bits(image)
+    return image.mode in ("I;16", "I;16B") or (image.mode == "I" and image.format == "PPM")
 
 
 def _has_16_bits(image: Image.Image) -> bool:
