@@ -154,3 +154,29 @@ def test_a_point_is_shown_by_the_pixel_around_its_place(seed: int) -> None:
     )
     middles = torch.stack([x, y], -1)[shown] + 0.5
     assert (places[shown] - middles).abs().max() <= 0.5 + 1e-4
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_lens_folds_where_its_radius_stops_to_grow(rng: np.random.Generator, count: int) -> None:
+    folds = 0
+    for _ in range(40):
+        k = rng.normal(0, 1.0, 3) * (np.arange(3) < count)
+        focal = np.diag([rng.uniform(30, 90)] * 2)
+        K = np.block([[focal, np.array([[30.5], [25.0]])], [np.zeros((1, 2)), np.ones((1, 1))]])
+        radius, share = Distortion(WIDTH, HEIGHT, K, (k[0], k[1], 0.0, 0.0, k[2])).fold()
+        # r (1 + k1 r^2 + k2 r^4 + k3 r^6) by r, as a polynomial of r^2
+        squares = np.roots([7 * k[2], 5 * k[1], 3 * k[0], 1])
+        real = squares[(np.abs(squares.imag) < 1e-9) & (squares.real > 0)].real
+        expected = focal[0, 0] * np.sqrt(real.min()) if len(real) else np.inf
+        corner = np.hypot(WIDTH - 0.5 - 30.5, 25.0 - 0.5)
+        if expected < corner - 1.5:
+            folds += 1
+            assert expected - 1e-3 <= radius < expected + 1.5 and share > 0
+        elif expected > corner:
+            assert (radius, share) == (np.inf, 0.0)
+    assert folds > 3
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_lens_that_can_be_undone_everywhere_folds_nowhere(lens: str) -> None:
+    assert Distortion(WIDTH, HEIGHT, K, LENSES[lens]).fold() == (np.inf, 0.0)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from evsplat.capture import Finding, load_capture, validate_capture
@@ -198,3 +199,43 @@ def test_a_folder_or_a_locked_file_in_place_of_the_description_is_named(
 def test_a_path_too_long_for_a_capture_is_no_folder(tmp_path: Path) -> None:
     (finding,) = validate_capture(tmp_path / ("x" * 5_000))
     assert finding.found == "no such folder"
+
+
+def test_a_principal_point_far_off_the_pictures_is_an_error_and_one_beside_them_a_warning(
+    tiny_capture: Factory, rng: np.random.Generator
+) -> None:
+    path = tiny_capture()  # of 32x24 pixels, with a focal length of 40.8
+    axis, sign = int(rng.integers(2)), int(rng.integers(2))
+    side = (32, 24)[axis]
+
+    def move(beyond: float) -> None:
+        put(path, ("cameras", "main", "K", axis, 2), side + beyond if sign else -beyond)
+
+    move(float(rng.uniform(3.01 * 40.8, 9_000)))
+    (finding,) = errors(path, "cameras.main.K")
+    assert "focal lengths" in finding.found and "outside the 32x24" in finding.found
+    assert "at most 3 focal lengths beside them" in finding.expected
+    move(float(rng.uniform(0.01, 2.99 * 40.8)))
+    (warning,) = validate_capture(path, deep=False)
+    assert (warning.severity, warning.field) == ("warning", "cameras.main.K")
+    assert "unless they were cut out of larger ones" in warning.expected
+    move(-float(rng.uniform(0, side)))
+    assert validate_capture(path, deep=False) == []
+
+
+def test_a_lens_that_folds_within_the_picture_is_one_warning_with_the_radius(
+    tiny_capture: Factory, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tiny_capture()
+    radius = float(rng.uniform(6, 16))  # of 20 pixels to the corner
+    k1 = -1 / (3 * (radius / 40.8) ** 2)
+    lens = {"model": "opencv", "coefficients": [k1, 0, 0, 0]}
+    put(path, ("cameras", "main", "distortion"), lens)
+    load_capture(path)
+    (message,) = [text for text in caplog.messages if "distortion" in text]
+    start = f"{path}/capture.json: cameras.main.distortion.coefficients: found a lens that folds"
+    assert message.startswith(start) and "one that folds nowhere in the 32x24 picture" in message
+    told = int(message.partition("over itself ")[2].split()[0])
+    assert radius - 0.6 <= told <= radius + 2
+    put(path, ("cameras", "main", "distortion"), lens | {"coefficients": [k1 / 20, 0, 0, 0]})
+    assert [f for f in validate_capture(path, deep=False) if "distortion" in f.field] == []

@@ -380,19 +380,19 @@ FAULTS = {
         lambda root: rewrite_camera(root, K=[1, 2]),
         {},
         DataError,
-        "camera.json: K: expected 3x3 numbers",
+        "camera.json: K: found .*expected 3x3 finite numbers",
     ),
     "K that is no number": (
         lambda root: rewrite_camera(root, K=[[float("inf"), 0, 1], [0, 1, 1], [0, 0, 1]]),
         {},
         DataError,
-        "camera.json: K: expected 3x3 numbers",
+        "camera.json: K: found .*expected 3x3 finite numbers",
     ),
     "K too large for a number": (
         lambda root: rewrite_camera(root, K=[[10**400, 0, 1], [0, 1, 1], [0, 0, 1]]),
         {},
         DataError,
-        "camera.json: K: expected 3x3 numbers",
+        "camera.json: K: found .*expected 3x3 finite numbers",
     ),
     "a time of another year": (
         lambda root: (root / "events.csv").write_text(f"t,x,y,p\n0,1,3,1\n{10**15},1,3,0\n"),

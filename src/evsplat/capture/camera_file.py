@@ -4,9 +4,10 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evsplat.capture.distortion import are_coefficients
+from evsplat.capture.fields import Fields
+from evsplat.capture.finding import Findings
+from evsplat.capture.parse_cameras import intrinsics, rigid
 from evsplat.errors import DataError
 from evsplat.pictures.light import TRANSFERS
 from evsplat.untrusted.faults import brief
@@ -39,23 +40,20 @@ def read_camera(
             f"{path}: transfer: found {brief(transfer)}, expected one of "
             f"{', '.join(TRANSFERS)}; correct it or leave it out."
         )
-    pose = _matrix(path, entry, "world_to_camera", 4) if "world_to_camera" in entry else None
+    findings = Findings()
+    fields = Fields(path, "", entry, tuple(entry), findings)
+    K = intrinsics(fields, width, height)
+    if "world_to_camera" in entry:
+        rigid(fields, "world_to_camera")
+    for finding in findings.items:
+        if finding.severity == "error":
+            raise DataError(f"{finding}")
     return {
-        "K": _matrix(path, entry, "K", 3),
-        "world_to_camera": pose,
+        "K": K,
+        "world_to_camera": entry.get("world_to_camera"),
         "distortion": _coefficients(path, entry.get("distortion")),
         "transfer": transfer,
     }
-
-
-def _matrix(path: Path, entry: dict[str, Any], key: str, size: int) -> np.ndarray:
-    try:
-        matrix = np.array(entry.get(key), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise DataError(f"{path}: {key}: expected {size}x{size} numbers.")
-    return matrix
 
 
 def _coefficients(path: Path, lens: Any) -> list[float] | None:

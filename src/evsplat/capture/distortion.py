@@ -10,6 +10,8 @@ from scipy.ndimage import map_coordinates
 _COUNTS = (4, 5, 8)
 _LARGEST = 1e9
 _ITERATIONS = 50
+_FOLD_GRID = 256
+"""Places along a side of the picture at which a fold is looked for, at most."""
 
 
 def are_coefficients(values: Sequence[object]) -> bool:
@@ -50,6 +52,25 @@ class Distortion:
             found = self._to_pixels(rays)
             error = np.abs(self.distort(found) - pixels).max(axis=-1, keepdims=True)
         return np.where(error < 0.1, found, np.nan)
+
+    def fold(self) -> tuple[float, float]:
+        """Where the model folds over itself in the pinhole picture: beyond which radius, how much.
+
+        The least distance from the principal point, pixels, at which `distort` turns what is
+        beside each other around, and the share of the picture that it does so to; infinity and
+        zero where it never does.
+        """
+        x, y = (
+            np.linspace(0.5, side - 0.5, min(side, _FOLD_GRID))
+            for side in (self.width, self.height)
+        )
+        pixels = np.stack(np.meshgrid(x, y), axis=-1)
+        rays = self._to_rays(pixels)
+        folded = ~(_area_factor(rays, self.coefficients) > 0)
+        if not folded.any():
+            return np.inf, 0.0
+        radii = np.linalg.norm(pixels - self.K[:2, 2], axis=-1)
+        return float(radii[folded].min()), float(folded.mean())
 
     def undistort_image(self, image: np.ndarray) -> Float[np.ndarray, "..."]:
         """The pinhole picture, float32, bilinear; beyond the sensor the nearest edge pixel.
@@ -98,6 +119,20 @@ def _radial_and_tangential(
         axis=-1,
     )
     return radial[..., None], tangential
+
+
+def _area_factor(
+    rays: Float[np.ndarray, "*batch 2"], coefficients: tuple[float, ...]
+) -> Float[np.ndarray, "*batch"]:
+    """By how much a small area at each ray grows in `_distort`; negative where it is mirrored."""
+    step = 1e-6
+    with np.errstate(all="ignore"):
+        along_x, along_y = (
+            _distort(rays + shift, coefficients) - _distort(rays - shift, coefficients)
+            for shift in (np.array([step, 0.0]), np.array([0.0, step]))
+        )
+        cross = along_x[..., 0] * along_y[..., 1] - along_x[..., 1] * along_y[..., 0]
+    return cross / (2 * step) ** 2
 
 
 def _distort(rays: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:

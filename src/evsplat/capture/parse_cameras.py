@@ -20,6 +20,8 @@ SMALLEST_PX = 11
 _LARGEST_PX = 16_384
 # From a fish eye's middle to a telescope.
 _FOCAL_IN_SIDES = (0.05, 200.0)
+# 72 degrees; the widest lenses that keep lines straight reach 65 in the corner of all they see.
+_OFF_AXIS_IN_FOCALS = 3.0
 
 
 def parse_cameras(
@@ -41,14 +43,15 @@ def parse_cameras(
             continue
         entry = top.inner(f"cameras.{name}", value, keys)
         width, height = _pixels(entry, "width"), _pixels(entry, "height")
-        K, pose = _intrinsics(entry, width, height), rigid(entry, "world_to_camera")
+        K, pose = intrinsics(entry, width, height), rigid(entry, "world_to_camera")
         coefficients, transfer = _distortion(entry), entry.choice("transfer", TRANSFERS)
         if not entry.valid or K is None or pose is None:
             continue
         K32 = torch.from_numpy(K.astype(np.float32))
         cameras[name] = Camera(width, height, K32, pose)
         if coefficients and any(coefficients):
-            distortions[name] = Distortion(width, height, K, coefficients)
+            distortions[name] = lens = Distortion(width, height, K, coefficients)
+            _check_unfolded(entry, lens)
         if transfer is not None:
             transfers[name] = transfer
     return cameras, distortions, transfers
@@ -69,7 +72,8 @@ def _pixels(entry: Fields, key: str) -> int:
     return count
 
 
-def _intrinsics(entry: Fields, width: int, height: int) -> np.ndarray | None:
+def intrinsics(entry: Fields, width: int, height: int) -> np.ndarray | None:
+    """K of a camera of pictures of that size as float64 [3, 3], None after a finding."""
     K = entry.numbers("K", (3, 3))
     if K is None:
         return None
@@ -92,7 +96,48 @@ def _intrinsics(entry: Fields, width: int, height: int) -> np.ndarray | None:
             "Give the focal length in pixels: that in millimetres over a pixel's size.",
         )
         return None
-    return K
+    return K if _sees_ahead(entry, K, width, height) else None
+
+
+def _sees_ahead(entry: Fields, K: np.ndarray, width: int, height: int) -> bool:
+    """Whether the pictures are near enough to the principal point; a finding if not within them."""
+    point, size = K[:2, 2], np.array([width, height])
+    outside = np.maximum(np.maximum(-point, point - size), 0)
+    found = (
+        f"a principal point of ({point[0]:g}, {point[1]:g}) pixels, outside the {width}x{height}"
+    )
+    focals = float(np.linalg.norm(outside / K[[0, 1], [0, 1]]))
+    if focals > _OFF_AXIS_IN_FOCALS:
+        entry.fail(
+            "K",
+            f"{found} by {focals:.3g} focal lengths",
+            f"one within the pictures, or at most {_OFF_AXIS_IN_FOCALS:g} focal lengths beside "
+            "them where they were cut out of larger ones",
+            "Give cx and cy in pixels of these pictures.",
+        )
+    elif focals > 0:
+        entry.findings.warning(
+            entry.file,
+            entry.field("K"),
+            found,
+            "one within the pictures, unless they were cut out of larger ones",
+            "If they were made smaller, K has to be made so with them.",
+        )
+    return focals <= _OFF_AXIS_IN_FOCALS
+
+
+def _check_unfolded(entry: Fields, lens: Distortion) -> None:
+    """A warning where the lens puts two places of the scene into one pixel, which none does."""
+    radius_px, share = lens.fold()
+    if share > 0:
+        entry.findings.warning(
+            entry.file,
+            entry.field("distortion.coefficients"),
+            f"a lens that folds over itself {radius_px:.0f} pixels from the principal point, so "
+            f"that {max(share, 0.001):.1%} of the picture shows again what is nearer to it",
+            f"one that folds nowhere in the {lens.width}x{lens.height} picture",
+            "Calibrate with points out to its corners or with fewer coefficients, or crop it.",
+        )
 
 
 def rigid(entry: Fields, key: str, default: Any = MISSING) -> Tensor | None:
