@@ -190,14 +190,14 @@ class Inspect:
     capture: Annotated[Positional[Path], option("CAPTURE"), Input(check_capture_or_recording)]
     """Capture folder (docs/capture-format.md), or an event file of any format."""
     out: Annotated[Path | None, option("FOLDER", default="inspect/CAPTURE")] = None
-    """Folder for the pictures."""
+    """Folder for the pictures; by default with a number where that shows another capture."""
     repair: Flag = False
     """Read on where an event file is damaged."""
 
     def __call__(self) -> None:
-        from evsplat.inspection import inspect
+        from evsplat.inspection import default_folder, inspect
 
-        out = self.out or Path("inspect") / self.capture.resolve().name
+        out = self.out or default_folder(self.capture)
         report = inspect(self.capture, out, repair=self.repair)
         if not report.usable:
             raise DataError(report.summary)

@@ -13,6 +13,7 @@ from evsplat.inspection.capture import (
     warn_of_capture,
 )
 from evsplat.inspection.event_check import warn_of_events
+from evsplat.inspection.folder import default_folder
 from evsplat.inspection.picture_check import warn_of_pictures
 from evsplat.inspection.recording import inspect, inspect_recording
 
@@ -21,6 +22,7 @@ __all__ = [
     "InspectReport",
     "body_mask_overlap",
     "check_body",
+    "default_folder",
     "fit_sheet",
     "inspect",
     "inspect_capture",

@@ -30,6 +30,7 @@ from evsplat.inspection.drawing import (
     sheet,
     short_number,
 )
+from evsplat.inspection.folder import note_inspected
 from evsplat.inspection.plots import draw_curve
 from evsplat.inspection.sensor import sensor_lines
 
@@ -43,13 +44,17 @@ _SHOWN_HOT_PIXELS = 6
 def inspect(path: Path | str, out_dir: Path | str, *, repair: bool = False) -> InspectReport:
     """Inspect a capture folder (`inspect_capture`) or an event recording (`inspect_recording`).
 
-    ``repair`` is of recordings alone.
+    ``repair`` is of recordings alone. inspected.json beside the drawings says what they show.
     """
     path = Path(path)
     # a ROS 2 bag is a folder with a metadata.yaml
     if path.is_file() or (path / "metadata.yaml").is_file():
-        return inspect_recording(path, out_dir, repair=repair)
-    return inspect_capture(path, out_dir)
+        report = inspect_recording(path, out_dir, repair=repair)
+    else:
+        report = inspect_capture(path, out_dir)
+    if report.pictures:
+        note_inspected(path, Path(out_dir))
+    return report
 
 
 def inspect_recording(

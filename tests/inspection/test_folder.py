@@ -1,0 +1,54 @@
+"""Where `evsplat inspect` draws when nobody says where: no capture's drawings replace another's."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from evsplat.cli import main
+from evsplat.inspection import default_folder
+
+Factory = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The working directory, which may be read by another path than its own."""
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+
+
+@pytest.mark.parametrize("name", ["dance", "a dance 100%", "tänzerin #2?"])
+def test_two_captures_of_one_name_have_a_folder_each(
+    tiny_capture: Factory, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    first, second = (
+        tiny_capture(f"{folder}/{name}", frames=4, seed=seed)
+        for seed, folder in enumerate(("one", "two"))
+    )
+    main(["inspect", str(first)])
+    folder = Path("inspect") / name
+    drawn = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert "contact_sheet.png" in drawn
+    main(["inspect", str(second)])
+    assert f"inspect/{name}-2: contact_sheet.png" in capsys.readouterr().out
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == drawn
+    again = Path("inspect") / f"{name}-2"
+    other = (again / "contact_sheet.png").read_bytes()
+    assert other != drawn["contact_sheet.png"]
+    link = Path("link")
+    link.symlink_to(second.parent)
+    assert default_folder(first) == folder
+    assert default_folder(link / name) == default_folder(second) == again
+
+
+def test_what_does_not_say_what_it_shows_stays(tiny_capture: Factory) -> None:
+    path = tiny_capture("dance", frames=4)
+    folders = [Path("inspect") / name for name in ("dance", "dance-2", "dance-3", "dance-4")]
+    folders[0].mkdir(parents=True)
+    assert default_folder(path) == folders[0]  # nothing is in it
+    (folders[0] / "mine.png").touch()
+    folders[1].touch()
+    folders[2].mkdir()
+    (folders[2] / "inspected.json").write_text("[")
+    assert default_folder(path) == folders[3]
