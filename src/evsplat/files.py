@@ -2,12 +2,13 @@
 
 import errno
 import json
+import logging
 import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, cast
 
@@ -28,6 +29,8 @@ from evsplat.errors import (
     only_writing_says,
     why_not_written,
 )
+
+logger = logging.getLogger(__name__)
 
 _READER_S, _AGAIN_S = 2.0, 0.02
 """Time that the reader of a pipe has to open it, and between two looks."""
@@ -176,22 +179,27 @@ def remove_folder(path: Path) -> None:
 
 
 @contextmanager
-def held_folder(path: Path, sign: str, busy: str) -> Iterator[None]:
+def held_folder(path: Path, sign: str, busy: str, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder, made where it is missing, by the lock of the file ``sign`` in it.
 
     The file goes at the end, and so does a folder that was made and has nothing else in it. Where
-    another process holds it there is a `ConfigError` that ends in ``busy``.
+    another process holds it there is a `ConfigError` that ends in ``busy``; to ``wait`` for its end
+    instead, that is logged.
     """
-    with _output_errors(path) as errors, _folder_of(path / sign, keep=False):
+    with _output_errors(path) as errors, _folder_of(path / sign, keep=False), ExitStack() as stack:
         try:
-            with held(path / sign):
-                try:
-                    with errors.of_writing():
-                        yield
-                finally:
-                    remove_file(path / sign)
+            stack.enter_context(held(path / sign))
         except BlockingIOError as error:
-            raise ConfigError(f"{path}: process {error.strerror} {busy}") from None
+            said = f"{path}: process {error.strerror} {busy}"
+            if not wait:
+                raise ConfigError(said) from None
+            logger.info("%s", said)
+            stack.enter_context(held(path / sign, wait=True))
+        try:
+            with errors.of_writing():
+                yield
+        finally:
+            remove_file(path / sign)
 
 
 def make_folder(path: Path) -> None:

@@ -1,6 +1,10 @@
 """The evaluator on small captures, whole and with parts missing."""
 
 import json
+import logging
+import os
+import threading
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,9 +12,10 @@ import pytest
 import torch
 from PIL import Image
 
-from evsplat.capture import Policy, load_capture
+from evsplat.capture import Capture, Policy, load_capture
 from evsplat.capture.policy import Terms, terms_of
 from evsplat.cli.runs import summary_table
+from evsplat.disk import held
 from evsplat.errors import DataError
 from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
@@ -282,13 +287,15 @@ def test_a_person_in_few_test_frames_or_none_is_told(tiny_capture, tmp_path, cap
     assert f"{path}: the person is in no test frame, so the figures" in caplog.text
 
 
-def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
-    capture = load_capture(tiny_capture("under_score"))
-    out = tmp_path / "run"
-    trained = SimpleNamespace(
-        path=out,
+def run_of(capture: Capture, path: Path) -> SimpleNamespace:
+    """What `load_run` might give of a folder, which is made with no more than its first file."""
+    path.mkdir()
+    (path / "config.yaml").touch()
+    return SimpleNamespace(
+        path=path,
         capture=capture,
         reconstruction=TruthWithNoise(capture, 0.05),
+        beside=lambda: TruthWithNoise(capture, 0.0),
         iteration=1200,
         train_seconds=61.5,
         human_only=False,
@@ -297,7 +304,36 @@ def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
         gaussians={"human": 10, "scene": 20},
         policy=Policy(held_out_events=True),
     )
-    trained.beside = lambda: TruthWithNoise(capture, 0.0)
+
+
+def test_an_evaluation_waits_for_another_one_before_it_reads_the_run(
+    tiny_capture, tmp_path, monkeypatch, caplog
+):
+    out, read = tmp_path / "run", threading.Event()
+    trained = run_of(load_capture(tiny_capture()), out)
+
+    def load_run(path, **_):
+        read.set()
+        return trained
+
+    monkeypatch.setattr(evaluation_run, "load_run", load_run)
+    caplog.set_level(logging.INFO, logger="evsplat.files")
+    with held(out / ".evaluating"):  # by another descriptor, as of another process
+        second = threading.Thread(target=evaluation_run.evaluate_run, args=[out])
+        second.start()
+        assert not read.wait(2.0)
+        assert {path.name for path in out.iterdir()} == {"config.yaml", ".evaluating"}
+    second.join(60.0)
+    assert read.is_set() and (out / "metrics.json").exists()
+    assert not (out / ".evaluating").exists()
+    (told,) = caplog.messages
+    assert told.startswith(f"{out}: process {os.getpid()} is evaluating this run")
+
+
+def test_a_run_gets_its_facts_and_tables(tiny_capture, tmp_path, monkeypatch):
+    capture = load_capture(tiny_capture("under_score"))
+    out = tmp_path / "run"
+    trained = run_of(capture, out)
     monkeypatch.setattr(evaluation_run, "load_run", lambda path, **_: trained)
     metrics = evaluation_run.evaluate_run(out)
     # Novel views alone are what cameras beside the recording one see.

@@ -273,6 +273,7 @@ def test_report_needs_an_evaluation(tiny_capture, tmp_path, monkeypatch):
     capture = load_capture(tiny_capture())
     trained = SimpleNamespace(capture=capture, reconstruction=TruthWithNoise(capture))
     monkeypatch.setattr(run, "load_run", lambda path: trained)
+    (tmp_path / "config.yaml").touch()
     with pytest.raises(DataError, match="evsplat evaluate"):
         run.write_report(tmp_path)
     evaluated(capture.path, tmp_path)

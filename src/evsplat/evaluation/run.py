@@ -1,6 +1,8 @@
 """A trained run measured, and its report page: what ``evsplat evaluate`` and ``report`` do."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +12,15 @@ from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import name_of
 from evsplat.evaluation.tables import write_tables
-from evsplat.files import try_target, write_json, write_text
+from evsplat.files import held_folder, try_target, write_json, write_text
+from evsplat.options.inputs import check_run_folder
 from evsplat.options.runs import Split
 from evsplat.render import choose_device
 from evsplat.training.run import Run, load_run, opened
 from evsplat.untrusted.faults import MISFITS, broken_as
+
+_SIGN = ".evaluating"
+"""File in a run folder that is there while it is evaluated, and whose lock the evaluation holds."""
 
 
 def evaluate_run(
@@ -28,10 +34,11 @@ def evaluate_run(
 
     ``device`` is where it is drawn and compared, not where it was trained. ``split="train"``
     measures the training frames against their sharp truth; its files are metrics_train.json and so
-    on, beside those of the test frames.
+    on, beside those of the test frames. Where another process evaluates the run this one waits.
     """
     device = choose_device(device)
-    return _measured(load_run(Path(run_dir), device=device), device, lpips_weights, split)
+    with _in_turn(Path(run_dir)):
+        return _measured(load_run(Path(run_dir), device=device), device, lpips_weights, split)
 
 
 def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
@@ -39,7 +46,8 @@ def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
 
     Figures and rendered pictures come from what `evaluate_run` wrote; the clip is drawn anew.
     """
-    return _reported(load_run(Path(run_dir)), Path(run_dir), split)
+    with _in_turn(Path(run_dir)):
+        return _reported(load_run(Path(run_dir)), Path(run_dir), split)
 
 
 def evaluate_and_report(
@@ -51,9 +59,22 @@ def evaluate_and_report(
 ) -> tuple[dict[str, Any], Path]:
     """`evaluate_run` and `write_report` of a run that is read once, here or before."""
     device = choose_device(device)
-    loaded = opened(run, device=device)
-    metrics = _measured(loaded, device, lpips_weights, split)
-    return metrics, _reported(loaded, loaded.path, split)
+    with _in_turn(run.path if isinstance(run, Run) else Path(run)):
+        loaded = opened(run, device=device)
+        metrics = _measured(loaded, device, lpips_weights, split)
+        return metrics, _reported(loaded, loaded.path, split)
+
+
+@contextmanager
+def _in_turn(run: Path) -> Iterator[None]:
+    """Be the only process that writes figures, pictures and reports of a run; others come after.
+
+    A run is read in the block, so that the last one measures the newest checkpoint.
+    """
+    check_run_folder(run)
+    busy = "is evaluating this run or writing its report; this one goes on when it is done."
+    with held_folder(run, _SIGN, busy, wait=True):
+        yield
 
 
 def _measured(
