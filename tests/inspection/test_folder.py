@@ -42,6 +42,15 @@ def test_two_captures_of_one_name_have_a_folder_each(
     assert default_folder(link / name) == default_folder(second) == again
 
 
+def test_a_link_to_a_capture_is_known_by_its_own_name(tiny_capture: Factory) -> None:
+    path = tiny_capture("far/dance v2", frames=4)
+    Path("dance").symlink_to(path)
+    assert default_folder(Path("dance")) == Path("inspect/dance")
+    assert main(["masks", "dance"]) == 0
+    assert Path("dance-masked/capture.json").is_file()
+    assert [folder.name for folder in path.parent.iterdir()] == ["dance v2"]
+
+
 def test_what_does_not_say_what_it_shows_stays(tiny_capture: Factory) -> None:
     path = tiny_capture("dance", frames=4)
     folders = [Path("inspect") / name for name in ("dance", "dance-2", "dance-3", "dance-4")]

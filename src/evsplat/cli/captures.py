@@ -1,5 +1,6 @@
 """Verbs that make captures and event recordings, or look at them; ``import`` is in `import_`."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -335,6 +336,6 @@ class Restore:
 
 
 def _beside(capture: Path, ending: str) -> Path:
-    """Folder beside a capture, named after it."""
-    folder = capture.resolve()
+    """Folder beside a capture, named after it; beside the link where a link leads to it."""
+    folder = Path(os.path.abspath(capture))
     return folder.with_name(f"{folder.name}-{ending}")

@@ -1,5 +1,6 @@
 """Folders of drawings below ``inspect/``: one for each capture or recording, whatever its name."""
 
+import os
 from pathlib import Path
 
 from evsplat.errors import DataError
@@ -20,7 +21,7 @@ def default_folder(path: Path) -> Path:
 
     A folder that does not say what it shows is left alone, unless it is empty.
     """
-    first = Path("inspect") / path.resolve().name
+    first = Path("inspect") / Path(os.path.abspath(path)).name  # of a link, its own
     folder, number = first, 1
     while not _is_free(folder, path):
         number += 1
