@@ -13,15 +13,18 @@ import pytest
 
 from evsplat import disk
 from evsplat.disk import held, is_held
-from evsplat.errors import DataError, OutputError
+from evsplat.errors import ConfigError, DataError, OutputError
 from evsplat.files import (
     atomic_path,
+    held_folder,
     new_folder,
     remove_folder,
     try_target,
     write_json,
     write_text,
 )
+
+from .limits import files_of_at_most
 
 
 def test_an_interrupted_writer_leaves_the_old_file(tmp_path: Path) -> None:
@@ -219,6 +222,17 @@ def test_folders_made_for_nothing_go_again(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_is_made_where_a_link_leads_that_nothing_is_at_yet(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("far/away")
+    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "link" / "in" / "a.txt"):
+        raise ZeroDivisionError
+    with held_folder(tmp_path / "link", "sign", "holds it."):
+        assert (tmp_path / "far" / "away" / "sign").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+    write_text(tmp_path / "link" / "in" / "a.txt", "whole")
+    assert (tmp_path / "far" / "away" / "in" / "a.txt").read_text() == "whole"
+
+
 @pytest.mark.parametrize(
     ("number", "said", "no_room"),
     [
@@ -298,3 +312,15 @@ def test_a_lock_is_held_once_and_ends_with_its_holder(tmp_path: Path) -> None:
             pass
         assert error.value.strerror == str(os.getpid())
     assert sign.exists() and not is_held(sign)
+
+
+def test_a_lock_is_held_on_a_full_disk_and_leaves_nothing(tmp_path: Path) -> None:
+    """There is room for a name, but none for the number of the process."""
+    with files_of_at_most(0), held_folder(tmp_path, "sign", "holds it."):
+        assert is_held(tmp_path / "sign") and (tmp_path / "sign").read_bytes() == b""
+        with (
+            pytest.raises(ConfigError, match="another process holds it"),
+            held_folder(tmp_path, "sign", "holds it."),
+        ):
+            pass
+    assert not list(tmp_path.iterdir())

@@ -92,7 +92,8 @@ def held(path: Path, *, wait: bool = False) -> Iterator[None]:
             if not is_at(handle, path):
                 continue  # whoever held it has removed it
             os.truncate(handle, 0)
-            os.pwrite(handle, str(os.getpid()).encode(), 0)
+            with suppress(OSError):  # a disk may be full; it is the lock that counts
+                os.pwrite(handle, str(os.getpid()).encode(), 0)
             yield
             return
         finally:

@@ -190,7 +190,8 @@ def held_folder(path: Path, sign: str, busy: str, *, wait: bool = False) -> Iter
         try:
             stack.enter_context(held(path / sign))
         except BlockingIOError as error:
-            said = f"{path}: process {error.strerror} {busy}"
+            holder = f"process {error.strerror}" if error.strerror else "another process"
+            said = f"{path}: {holder} {busy}"
             if not wait:
                 raise ConfigError(said) from None
             logger.info("%s", said)
@@ -296,8 +297,9 @@ def _folder_of(target: Path, *, keep: bool = True) -> Iterator[None]:
 
     ``keep`` what was made for something; else what is empty at the end goes in any case.
     """
-    made = [folder for folder in target.parents if not folder.exists()]
-    target.parent.mkdir(parents=True, exist_ok=True)
+    parent = Path(os.path.realpath(target.parent))  # a link may lead to what is not there yet
+    made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+    parent.mkdir(parents=True, exist_ok=True)
     try:
         yield
         made = [] if keep else made

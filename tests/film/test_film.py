@@ -22,6 +22,8 @@ from evsplat.film.frame_cache import FilmFrame, FrameCache
 from evsplat.methods.reconstruction import Rendering
 from evsplat.pictures.video import write_animation
 
+from ..limits import files_of_at_most
+
 LAST_US = 9 * 40_000
 
 
@@ -215,6 +217,13 @@ def test_the_folder_that_one_is_in_is_no_name_for_a_film(lamp, tmp_path, monkeyp
     with pytest.raises(ConfigError, match=r"--out \.: has no name of its own"):
         render_run(lamp.run, out=".")
     assert not list((tmp_path / "film").iterdir())
+
+
+def test_where_not_even_the_plan_has_room_no_folder_is_left(lamp, tmp_path):
+    with files_of_at_most(0):
+        with pytest.raises(OutputError, match=r"film\.mp4\.partial/plan\.json: not written"):
+            render_run(lamp.run, out=tmp_path / "in" / "film.mp4")
+    assert not (tmp_path / "in").exists()
 
 
 def test_a_folder_in_the_way_of_kept_pictures_is_left_alone(lamp, tmp_path):

@@ -4,7 +4,6 @@ import errno
 import json
 import logging
 import os
-import resource
 import shutil
 import signal
 import sys
@@ -22,6 +21,7 @@ from evsplat.training.trainer import Trainer
 from evsplat.training_sign import is_training
 from evsplat.view.viewed_run import load_newest
 
+from ..limits import files_of_at_most
 from ..small_model import small
 from .test_train import final_tensors
 
@@ -189,12 +189,8 @@ def test_where_files_may_not_grow_the_training_ends_in_a_sentence(tiny_capture, 
     out = tmp_path / "run"
     settings = [f"--set={setting}" for setting in small("evsplat")]
     command = ["train", str(tiny_capture()), "--out", str(out), "--iterations", "3", *settings]
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
-    try:
+    with files_of_at_most(30_000):
         assert main(command) == 2
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     told = capsys.readouterr().err.splitlines()[-1]
     assert "000003.safetensors: not written, files may not grow so large here" in told
     assert told.endswith("No checkpoint is kept: once that is mended, train again.")

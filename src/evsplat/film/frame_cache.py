@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from evsplat.camera import Camera
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, make_folder, remove_folder, write_json
+from evsplat.files import atomic_path, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.meanwhile import meanwhile
 from evsplat.names import checked_name
@@ -61,7 +61,6 @@ class FrameCache:
         if plan.is_file() and read_json(plan) != {"plan": digest}:
             logger.info("%s: kept pictures belong to other options; starting over.", path)
             remove_folder(path)
-        make_folder(path)
         write_json(plan, {"plan": digest})
 
     def __len__(self) -> int:
