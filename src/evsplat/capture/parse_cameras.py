@@ -104,7 +104,8 @@ def _sees_ahead(entry: Fields, K: np.ndarray, width: int, height: int) -> bool:
     point, size = K[:2, 2], np.array([width, height])
     outside = np.maximum(np.maximum(-point, point - size), 0)
     found = (
-        f"a principal point of ({point[0]:g}, {point[1]:g}) pixels, outside the {width}x{height}"
+        f"a principal point of ({point[0]:g}, {point[1]:g}) pixels, outside the "
+        f"{width}x{height} picture"
     )
     focals = float(np.linalg.norm(outside / K[[0, 1], [0, 1]]))
     if focals > _OFF_AXIS_IN_FOCALS:
