@@ -131,6 +131,29 @@ def test_ctrl_c_that_python_drops_is_heard_all_the_same():
     assert (done.returncode, done.stderr) == (130, "\nevsplat: Stopped.\n")
 
 
+class StoppedAgain:
+    """Like a progress bar, which is closed when it is given back, with the traceback of a stop."""
+
+    def __del__(self) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):
+            pass
+
+
+def test_a_second_ctrl_c_while_a_stop_is_told_has_no_words(capfd):
+    def work() -> None:
+        held = StoppedAgain()  # noqa: F841 - the traceback has it
+        stop_here()
+
+    dropped = sys.unraisablehook
+    sys.unraisablehook = sys.__unraisablehook__  # in place of pytest's
+    try:
+        assert exit_code(work) == 130
+    finally:
+        sys.unraisablehook = dropped
+    assert capfd.readouterr().err == "\nevsplat: Stopped.\n"
+
+
 def stop_here() -> None:
     os.kill(os.getpid(), signal.SIGINT)
     for _ in range(1000):

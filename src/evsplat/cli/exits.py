@@ -40,15 +40,21 @@ def exit_code(work: Callable[[], object]) -> int:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("evsplat").setLevel(logging.INFO)
     stops = _Stops()
+    with stops, _dropped_interrupts_again(), _output_named():
+        return _code(work, stops)
+
+
+def _code(work: Callable[[], object], stops: "_Stops") -> int:
+    """`exit_code`, while stops are taken."""
     try:
-        with stops, _dropped_interrupts_again(), _output_named():
-            try:
-                work()
-            finally:
-                # A reader that went away is noticed here, not at the interpreter's end.
-                if sys.stdout is not None:  # closed by whoever started this
-                    sys.stdout.flush()
+        try:
+            work()
+        finally:
+            # A reader that went away is noticed here, not at the interpreter's end.
+            if sys.stdout is not None:  # closed by whoever started this
+                sys.stdout.flush()
     except KeyboardInterrupt as stop:
+        stops.are_over()
         return _stopped(str(stop))
     except BrokenPipeError:
         # Whoever reads, such as head, has enough. What is still buffered goes nowhere, quietly.
@@ -56,6 +62,7 @@ def exit_code(work: Callable[[], object]) -> int:
         return _NOBODY_READS
     except Exception as error:
         if stops.became(error):
+            stops.are_over()
             return _stopped()
         if isinstance(error, EvsplatError):
             return _said(error)
@@ -154,12 +161,19 @@ class _Stops:
 
     def __init__(self) -> None:
         self._came = False
+        self._over = False
         self._before: dict[int, Any] = {}
 
     def __call__(self, number: int, frame: object) -> None:
         """Take a signal."""
+        if self._over:
+            return
         self._came = True
         raise KeyboardInterrupt
+
+    def are_over(self) -> None:
+        """The work has stopped: another would only fall among last words and what is given back."""
+        self._over = True
 
     def became(self, error: BaseException | None) -> bool:
         """Whether a library in C made this error of a stop, which did not lead to it otherwise."""
