@@ -11,6 +11,10 @@
 #include <utility>
 #include <vector>
 
+#if !defined(_WIN32)
+#include <sys/mman.h>
+#endif
+
 #include "list.h"
 
 namespace evsplat {
@@ -41,8 +45,14 @@ class BlockCache {
         }
         // Head-room, because the number of intersections changes a little from step to step.
         bytes = (bytes + bytes / 4 + 4095) / 4096 * 4096;
-        void* data = std::aligned_alloc(64, bytes);
+        // In pages of 2 MB where the system has them: what streams through many small ones waits for their addresses.
+        const bool huge = bytes >= 2 * kHugePage;
+        if (huge) bytes = (bytes + kHugePage - 1) / kHugePage * kHugePage;
+        void* data = std::aligned_alloc(huge ? kHugePage : 64, bytes);
         if (!data) throw std::bad_alloc();
+#if defined(MADV_HUGEPAGE)
+        if (huge) madvise(data, bytes, MADV_HUGEPAGE);
+#endif
         return data;
     }
 
@@ -62,6 +72,7 @@ class BlockCache {
         void* data;
         size_t bytes;
     };
+    static constexpr size_t kHugePage = size_t(2) << 20;
     static constexpr size_t kMaxBlocks = 256, kMaxBytes = size_t(512) << 20;
     std::mutex mutex_;
     std::vector<Block> free_;  // oldest first

@@ -271,14 +271,21 @@ void forward(const ForwardJob& job, const TileWork& work) {
 }
 
 // Sum over the times of a tile: what shows the same picture gets the same gradient.
-INLINE void load_gradient(const Tile& t, const TileWork& work, F* patches, int step, const float* plane,
-                          ptrdiff_t st, ptrdiff_t sx, ptrdiff_t sy) {
-    load_plane(t, patches, step, plane + work.times[0] * st, sx, sy);
-    for (uint32_t i = 1; i < work.time_count; ++i) {
+INLINE void load_gradient(const Tile& t, const TileWork& work, F* patches, int step, const PlaneGrad* of, ptrdiff_t of_t) {
+    bool any = false;
+    for (uint32_t i = 0; of && i < work.time_count; ++i) {
+        const PlaneGrad& plane = of[work.times[i] * of_t];
+        if (!plane.data) continue;
+        if (!any) {
+            load_plane(t, patches, step, plane.data, plane.right, plane.down);
+            any = true;
+            continue;
+        }
         F more[kPatches];
-        load_plane(t, more, 1, plane + work.times[i] * st, sx, sy);
+        load_plane(t, more, 1, plane.data, plane.right, plane.down);
         for (int p = 0; p < kPatches; ++p) patches[p * step] += more[p];
     }
+    for (int p = 0; p < kPatches && !any; ++p) patches[p * step] = F{};
 }
 
 // Back to front, with two running scalars per pixel: the transmittance T_i and the gradient-weighted
@@ -303,20 +310,14 @@ void backward(const BackwardJob& back, const TileWork& work, bool add) {
     __builtin_memcpy(transmittance, work.final_t, sizeof transmittance);
     __builtin_memcpy(last, work.last, sizeof last);
 
-    if (back.alpha_grad)
-        load_gradient(tile, work, value, 1, back.alpha_grad, back.alpha_grad_t, back.alpha_grad_x, back.alpha_grad_y);
-    for (int p = 0; p < kPatches; ++p) behind[p] = back.alpha_grad ? -value[p] : F{};
+    load_gradient(tile, work, value, 1, back.alpha_grad, back.alpha_grad_t);
+    for (int p = 0; p < kPatches; ++p) behind[p] = -value[p];
     const bool lit = job.light;
     if (lit) load_plane(tile, light, 1, job.light, 1, view.width);
     for (int p = 0; p < kPatches && lit; ++p) light_grad[p] = F{};
     for (int k = 0; k < channels; ++k) {
         F* of = grad + k;
-        if (back.image_grad) {
-            load_gradient(tile, work, of, channels, back.image_grad + k * back.image_grad_c, back.image_grad_t,
-                          back.image_grad_x, back.image_grad_y);
-        } else {
-            for (int p = 0; p < kPatches; ++p) of[p * channels] = F{};
-        }
+        load_gradient(tile, work, of, channels, back.image_grad ? back.image_grad + k : nullptr, back.image_grad_t);
         if (!job.background) continue;
         load_plane(tile, value, 1, job.background + k * job.background_c, job.background_x, job.background_y);
         if (lit && k < kLitChannels) {

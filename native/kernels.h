@@ -94,11 +94,16 @@ struct TileWork {
     uint32_t* patch_end;          // (patches) entries after which a patch is opaque
 };
 
+// The gradient of one channel of a picture, element (y, x) at data[y * down + x * right]; null is zero.
+struct PlaneGrad {
+    const float* data = nullptr;
+    ptrdiff_t down = 0, right = 0;
+};
+
 struct BackwardJob {
     ForwardJob forward;
-    const float *image_grad, *alpha_grad;  // any strides; may be null
-    ptrdiff_t image_grad_t, image_grad_c, image_grad_x, image_grad_y;
-    ptrdiff_t alpha_grad_t, alpha_grad_x, alpha_grad_y;
+    const PlaneGrad *image_grad, *alpha_grad;  // of channel k at time t: image_grad[t * image_grad_t + k]; null: zero
+    ptrdiff_t image_grad_t, alpha_grad_t;
     float* slots;                 // (slots, slot_stride(C))
     float* background_grad;       // null, or (tiles, C) or (H, W, value_stride), added to
     bool background_is_image;

@@ -94,24 +94,36 @@ class Render {
                                  still_radii.data());
     }
 
-    void backward(std::optional<Strided> image_grad, std::optional<Strided> alpha_grad, OutFields moving,
-                  OutFields still, std::optional<Out> view, std::optional<Out> background, std::optional<Out> light) {
+    // `image_grad`: of groups of channels (H, W, c), of all times of the first group, of all of the second, ...; none is
+    // zero, as is an empty list.
+    void backward(const std::vector<std::optional<Strided>>& image_grad, const std::vector<size_t>& groups,
+                  std::optional<Strided> alpha_grad, OutFields moving, OutFields still, std::optional<Out> view,
+                  std::optional<Out> background, std::optional<Out> light) {
         if (!record_) throw std::runtime_error("evsplat._native: backward before forward");
         const size_t h = scene_.view.height, w = scene_.view.width, t = scene_.times, c = scene_.channels;
         OutputGrads out;
-        if (image_grad) {
-            require(image_grad->ndim() == 4 && image_grad->shape(0) == t && image_grad->shape(1) == h &&
-                        image_grad->shape(2) == w && image_grad->shape(3) == c,
-                    "image gradient");
-            out.image_data = image_grad->data();
-            for (int i = 0; i < 4; ++i) out.image[i] = image_grad->stride(i);
+        require(image_grad.size() == groups.size() * t, "image gradient");
+        out.image.resize(image_grad.empty() ? 0 : t * c);
+        size_t first = 0;
+        for (size_t g = 0; g < groups.size(); first += groups[g++]) {
+            require(groups[g] <= c && first + groups[g] <= c, "image gradient");
+            for (size_t i = 0; i < t; ++i) {
+                const auto& part = image_grad[g * t + i];
+                if (!part) continue;
+                require(part->ndim() == 3 && part->shape(0) == h && part->shape(1) == w && part->shape(2) == groups[g],
+                        "image gradient");
+                for (size_t k = 0; k < groups[g]; ++k)
+                    out.image[i * c + first + k] = {part->data() + ptrdiff_t(k) * part->stride(2), part->stride(0),
+                                                    part->stride(1)};
+            }
         }
         if (alpha_grad) {
             require(alpha_grad->ndim() == 3 && alpha_grad->shape(0) == t && alpha_grad->shape(1) == h &&
                         alpha_grad->shape(2) == w,
                     "alpha gradient");
-            out.alpha_data = alpha_grad->data();
-            for (int i = 0; i < 3; ++i) out.alpha[i] = alpha_grad->stride(i);
+            for (size_t i = 0; i < t; ++i)
+                out.alpha.push_back({alpha_grad->data() + ptrdiff_t(i) * alpha_grad->stride(0), alpha_grad->stride(1),
+                                     alpha_grad->stride(2)});
         }
         InputGrads in;
         fill_grads(in.moving, moving, scene_.moving, t);
@@ -435,7 +447,7 @@ NB_MODULE(_native, m) {
              nb::arg("light").none(), nb::arg("times"), nb::arg("threads"))
         .def("forward", &Render::forward, nb::arg("image"), nb::arg("alpha"), nb::arg("radii"),
              nb::arg("still_radii"), nb::arg("keep") = false, nb::arg("earlier").none() = nb::none())
-        .def("backward", &Render::backward, nb::arg("image_grad").none(), nb::arg("alpha_grad").none(),
+        .def("backward", &Render::backward, nb::arg("image_grad"), nb::arg("groups"), nb::arg("alpha_grad").none(),
              nb::arg("moving"), nb::arg("still"), nb::arg("view").none(), nb::arg("background").none(),
              nb::arg("light").none())
         .def_prop_ro("seconds", &Render::seconds, "Work so far by stage, summed over threads.")

@@ -196,14 +196,12 @@ INLINE void prefetch_tile(const BackwardJob& back, const TileWork& work, const T
         prefetch_backward(back, work.entries, stride, (work.count - 1) / kRun * kRun, work.count);
     const int x = tile.x0 + kTile;
     if (x + kTile > back.forward.view.width || tile.rows < kTile) return;
-    if (back.image_grad && back.image_grad_x == 1)
-        for (int k = 0; k < back.forward.channels; ++k)
-            prefetch_rows<0>(back.image_grad + k * back.image_grad_c + work.times[0] * back.image_grad_t +
-                                 tile.y0 * back.image_grad_y + x,
-                             back.image_grad_y);
-    if (back.alpha_grad && back.alpha_grad_x == 1)
-        prefetch_rows<0>(back.alpha_grad + work.times[0] * back.alpha_grad_t + tile.y0 * back.alpha_grad_y + x,
-                         back.alpha_grad_y);
+    const auto prefetch = [&](const PlaneGrad& plane) {
+        if (plane.data && plane.right == 1) prefetch_rows<0>(plane.data + tile.y0 * plane.down + x, plane.down);
+    };
+    for (int k = 0; back.image_grad && k < back.forward.channels; ++k)
+        prefetch(back.image_grad[work.times[0] * back.image_grad_t + k]);
+    if (back.alpha_grad) prefetch(back.alpha_grad[work.times[0] * back.alpha_grad_t]);
 }
 
 // A bit per patch that is not opaque before entry `index`.

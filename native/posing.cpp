@@ -147,20 +147,23 @@ void change_shape(const ShapeChange& job, int threads, float* moved, float* scal
 void change_shape_backward(const ShapeChange& job, const float* scales, const ShapeGrad (&above)[4], int threads,
                            float* changes, float* means, float* scales_log, float* quaternions) {
     const size_t rest = job.columns - kShapeChanges;
+    // Times are taken one after the other: many places in memory read from at once are slow.
     in_pieces(threads, job.points, kPiece, [&](size_t begin, size_t end) {
-        for (size_t i = begin; i < end; ++i) {
-            const Unit q(job.quaternions + i * 4);
-            float mean[3] = {}, scale_log[3] = {}, unit[4] = {};
-            for (size_t t = 0; t < job.times; ++t) {
+        std::fill(means + begin * 3, means + end * 3, 0.f);
+        std::fill(scales_log + begin * 3, scales_log + end * 3, 0.f);
+        std::fill(quaternions + begin * 4, quaternions + end * 4, 0.f);
+        for (size_t t = 0; t < job.times; ++t)
+            for (size_t i = begin; i < end; ++i) {
+                const Unit q(job.quaternions + i * 4);
                 const size_t row = t * job.points + i;
                 const float* by = job.changes + row * job.columns;
-                float* to = changes + row * job.columns;
+                float *to = changes + row * job.columns, *mean = means + i * 3, *unit = quaternions + i * 4;
                 const auto grad = [&](int which, int c) {
                     return above[which].data ? above[which].data[row * above[which].step + c] : 0.f;
                 };
                 for (int c = 0; c < 3; ++c) {
                     to[c] = grad(0, c), to[3 + c] = grad(1, c) * scales[row * 3 + c];
-                    mean[c] += to[c], scale_log[c] += to[3 + c];
+                    mean[c] += to[c], scales_log[i * 3 + c] += to[3 + c];
                 }
                 const float w = grad(2, 0), x = grad(2, 1), y = grad(2, 2), z = grad(2, 3);
                 to[6] = -w * q.x + x * q.w - y * q.z + z * q.y;
@@ -175,10 +178,12 @@ void change_shape_backward(const ShapeChange& job, const float* scales, const Sh
                 else
                     std::fill_n(to + kShapeChanges, rest, 0.f);
             }
+        for (size_t i = begin; i < end; ++i) {
+            const Unit q(job.quaternions + i * 4);
+            float* unit = quaternions + i * 4;
             const float along = unit[0] * q.w + unit[1] * q.x + unit[2] * q.y + unit[3] * q.z;
             const float direction[4] = {q.w, q.x, q.y, q.z};
-            for (int c = 0; c < 3; ++c) means[i * 3 + c] = mean[c], scales_log[i * 3 + c] = scale_log[c];
-            for (int c = 0; c < 4; ++c) quaternions[i * 4 + c] = (unit[c] - along * direction[c]) * q.inverse_length;
+            for (int c = 0; c < 4; ++c) unit[c] = (unit[c] - along * direction[c]) * q.inverse_length;
         }
     });
 }

@@ -308,17 +308,16 @@ void light_tile_backward(const Scene& s, const Record& r, const TileWork& work, 
             const ptrdiff_t t = work.times[i];
             const size_t to = (row - top) * kTile;
             float given[kTile], by_light[kTile] = {};
-            const auto load = [&](const float* from, ptrdiff_t step) {
-                for (size_t x = 0; x < columns; ++x) given[x] = from[ptrdiff_t(x) * step];
+            const auto load = [&](const PlaneGrad& plane) {
+                const float* from = plane.data + ptrdiff_t(row) * plane.down + ptrdiff_t(left) * plane.right;
+                for (size_t x = 0; plane.data && x < columns; ++x) given[x] = from[ptrdiff_t(x) * plane.right];
+                return plane.data != nullptr;
             };
-            if (out.alpha_data) {
-                load(out.alpha_data + t * out.alpha[0] + ptrdiff_t(row) * out.alpha[1] + ptrdiff_t(left) * out.alpha[2], out.alpha[2]);
+            if (!out.alpha.empty() && load(out.alpha[t]))
                 for (size_t x = 0; x < columns; ++x) alpha[to + x] += given[x];
-            }
             const float* light = s.light + size_t(t) * pixels + at;
-            for (int k = 0; k < s.channels && out.image_data; ++k) {
-                load(out.image_data + t * out.image[0] + ptrdiff_t(row) * out.image[1] + ptrdiff_t(left) * out.image[2] + k * out.image[3],
-                     out.image[2]);
+            for (int k = 0; k < s.channels && !out.image.empty(); ++k) {
+                if (!load(out.image[t * s.channels + k])) continue;
                 float* sum = image + k * kTilePixels + to;
                 if (k >= kLitChannels) {
                     for (size_t x = 0; x < columns; ++x) sum[x] += given[x];
@@ -478,29 +477,24 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
             for_pictures(r, tile, [&](const TileWork& work) {
                 BackwardJob job = {};
                 job.forward = forward_job(s, r, work.times[0], c, channels);
-                if (out.image_data) {
-                    job.image_grad = out.image_data + c * out.image[3];
-                    job.image_grad_t = out.image[0], job.image_grad_y = out.image[1];
-                    job.image_grad_x = out.image[2], job.image_grad_c = out.image[3];
-                }
-                if (out.alpha_data && c == 0) {
-                    job.alpha_grad = out.alpha_data;
-                    job.alpha_grad_t = out.alpha[0], job.alpha_grad_y = out.alpha[1], job.alpha_grad_x = out.alpha[2];
-                }
+                if (!out.image.empty()) job.image_grad = out.image.data() + c, job.image_grad_t = s.channels;
+                if (!out.alpha.empty() && c == 0) job.alpha_grad = out.alpha.data(), job.alpha_grad_t = 1;
                 job.slots = slots.data();
                 job.background_is_image = s.background_is_image;
                 if (in.background)
                     job.background_grad = s.background_is_image ? in.background + c : background_parts.data();
                 TileWork seen = work;
+                PlaneGrad summed[kMaxChannels + 1];
                 if (s.light && work.bare) {
                     thread_local std::vector<float> grads;
                     grads.resize(size_t(s.channels + 1) * kTilePixels);
                     float* alpha = grads.data() + s.channels * kTilePixels;
                     light_tile_backward(s, r, work, out, grads.data(), alpha, in.light);
                     const ptrdiff_t first = tile / s.view.tiles_x * kTile * kTile + tile % s.view.tiles_x * kTile;
-                    job.image_grad = grads.data() - first, job.alpha_grad = alpha - first;
-                    job.image_grad_c = kTilePixels, job.image_grad_t = job.alpha_grad_t = 0;
-                    job.image_grad_y = job.alpha_grad_y = kTile, job.image_grad_x = job.alpha_grad_x = 1;
+                    for (int k = 0; k < channels; ++k) summed[k] = {grads.data() + k * kTilePixels - first, kTile, 1};
+                    summed[channels] = {alpha - first, kTile, 1};
+                    job.image_grad = summed, job.alpha_grad = summed + channels;
+                    job.image_grad_t = job.alpha_grad_t = 0;
                     seen.time_count = 1;
                 } else if (s.light) {
                     job.forward.light = s.light + work.times[0] * pixels;

@@ -95,9 +95,7 @@ std::unique_ptr<Record> render_forward(const Scene&, int threads, bool keep, std
                                        float* image, float* alpha, int32_t* radii, int32_t* still_radii);
 
 struct OutputGrads {
-    const float *image_data = nullptr, *alpha_data = nullptr;  // null: zero
-    ptrdiff_t image[4] = {};  // strides of t, y, x, c
-    ptrdiff_t alpha[3] = {};  // strides of t, y, x
+    std::vector<PlaneGrad> image, alpha;  // (T, C) and (T); empty: zero
 };
 
 struct InputGrads {

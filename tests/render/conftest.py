@@ -126,7 +126,7 @@ def all_gradients(
         for value in (out.image, out.alpha)
     )
     gradients = [value.cpu() for value in torch.autograd.grad(loss, list(leaves.values()))]
-    out = RenderOutput(*(getattr(out, field.name).cpu() for field in fields(RenderOutput)))
+    out = RenderOutput(*(x.cpu() for x in (out.image, out.alpha, out.radii, out.static_radii)))
     return out, dict(zip(leaves, gradients, strict=True))
 
 

@@ -14,7 +14,7 @@ from evsplat.camera import Camera, distinct
 from evsplat.compiled import native, runs_native
 from evsplat.models.layers import SHADOW_STEP_PX, Layers
 from evsplat.models.scene_places import LEAST_SCENE, ScenePlaces
-from evsplat.render import Backdrop, RenderOutput, Splats, render, split_channels
+from evsplat.render import Backdrop, RenderOutput, Splats, render
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,10 @@ def draw(
         low_pass=layers.low_pass,
         backdrop=backdrop,
         static_light=light,
+        groups=(3, 1),
     )
-    return _drawing(output, layers)
+    rgb, semantic = output.groups
+    return Drawing(rgb, tuple(s.squeeze(-1) for s in semantic), output, layers)
 
 
 def draw_for_training(
@@ -93,21 +95,19 @@ def draw_for_training(
     if len(cameras) == 1:
         return draw(layers, cameras[0], background=background, places=places)
     each = [
-        draw(layers.of_time(index), camera, background=background, places=places).output
+        draw(layers.of_time(index), camera, background=background, places=places)
         for index, camera in enumerate(cameras)
     ]
+    outputs = [one.output for one in each]
     output = RenderOutput(
-        image=torch.cat([one.image for one in each]),
-        alpha=torch.cat([one.alpha for one in each]),
-        radii=torch.cat([one.radii for one in each]),
-        static_radii=torch.stack([one.static_radii for one in each]).amax(0),
+        image=torch.cat([one.image for one in outputs]),
+        alpha=torch.cat([one.alpha for one in outputs]),
+        radii=torch.cat([one.radii for one in outputs]),
+        static_radii=torch.stack([one.static_radii for one in outputs]).amax(0),
     )
-    return _drawing(output, layers)
-
-
-def _drawing(output: RenderOutput, layers: Layers) -> Drawing:
-    rgb, semantic = split_channels(output.image, (3, 1))
-    return Drawing(rgb, tuple(s.squeeze(-1) for s in semantic), output, layers)
+    rgb = tuple(picture for one in each for picture in one.rgb)
+    semantic = tuple(picture for one in each for picture in one.semantic)
+    return Drawing(rgb, semantic, output, layers)
 
 
 def _behind(rgb: Float[Tensor, "3"], layer: Splats) -> Float[Tensor, "C"]:

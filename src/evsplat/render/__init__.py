@@ -3,7 +3,7 @@
 from evsplat.render.api import choose_device, render
 from evsplat.render.job import Backdrop, same_memory, same_values
 from evsplat.render.native import rows_in_view
-from evsplat.render.splats import LOW_PASS, RenderOutput, Splats, split_channels
+from evsplat.render.splats import LOW_PASS, RenderOutput, Splats
 
 __all__ = [
     "LOW_PASS",
@@ -15,5 +15,4 @@ __all__ = [
     "rows_in_view",
     "same_memory",
     "same_values",
-    "split_channels",
 ]

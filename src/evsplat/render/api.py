@@ -1,6 +1,8 @@
 """`render`: checks its input, picks the backend and hands over."""
 
 import logging
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Literal, get_args
 
@@ -14,7 +16,7 @@ from evsplat.errors import BackendError, ConfigError
 from evsplat.render import cuda, native, reference
 from evsplat.render.job import Backdrop, RenderJob
 from evsplat.render.light import LIT_CHANNELS, MOST_LIT, lit_apart
-from evsplat.render.splats import LOW_PASS, RenderOutput, Splats
+from evsplat.render.splats import LOW_PASS, RenderOutput, Splats, split_channels
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +37,7 @@ def render(
     low_pass: float = LOW_PASS,
     backdrop: Backdrop | None = None,
     static_light: Float[Tensor, "T H W"] | None = None,
+    groups: Sequence[int] = (),
 ) -> RenderOutput:
     """Composite the Gaussians front to back, by the rules of gsplat 1.5 ("classic" mode).
 
@@ -52,6 +55,9 @@ def render(
 
     ``static_light`` is a factor on the first three channels of what ``static`` and the background
     add to each pixel.
+
+    ``groups`` are sizes of groups of channels, all of them, that come as pictures of each time as
+    well. Gradients then go through these: ``image`` need not have any.
 
     ``auto`` takes ``native`` for tensors on the CPU and ``gsplat`` for those on a CUDA device. A
     backend that cannot run is a `BackendError` with the reason, never another one's work.
@@ -71,6 +77,11 @@ def render(
         _check_light(static_light, splats, camera, times)
     if not low_pass > 0:
         raise BackendError(f"render: low_pass is {low_pass}, expected px^2 above 0.")
+    if groups and sum(groups) != splats.channels.shape[-1]:
+        raise BackendError(
+            f"render: groups are {list(groups)}, together {sum(groups)}, expected "
+            f"{splats.channels.shape[-1]}, the number of channels."
+        )
     if backdrop is not None and torch.is_grad_enabled():
         raise BackendError("render: a backdrop has no gradients; draw within torch.no_grad().")
 
@@ -78,9 +89,13 @@ def render(
         splats, static, times, camera, background, near, low_pass, backdrop, static_light
     )
     draw = _BACKENDS[chosen]
-    if static_light is None or (chosen == "native" and not _needs_gradient(background)):
-        return draw(job)
-    return lit_apart(job, draw)
+    if static_light is not None and (chosen != "native" or _needs_gradient(background)):
+        drawn = lit_apart(job, draw)
+    else:
+        drawn = draw(replace(job, groups=tuple(groups)))
+    if groups and not drawn.groups:
+        drawn = replace(drawn, groups=split_channels(drawn.image, groups))
+    return drawn
 
 
 def _chosen(backend: BackendName, device: torch.device) -> str:

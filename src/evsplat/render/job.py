@@ -29,6 +29,8 @@ class RenderJob:
     """Added to the projected covariances, px^2."""
     backdrop: "Backdrop | None" = None
     static_light: Tensor | None = None
+    groups: tuple[int, ...] = ()
+    """Sizes of the groups of channels that come as pictures of their own; empty: none."""
 
 
 class Backdrop:

@@ -12,7 +12,7 @@ from evsplat.camera import Camera
 from evsplat.compiled import import_error, native, runs_native
 from evsplat.errors import BackendError
 from evsplat.render.job import RenderJob
-from evsplat.render.splats import RenderOutput, Splats
+from evsplat.render.splats import RenderOutput, Splats, by_group, pictures_of
 
 
 def render(job: RenderJob) -> RenderOutput:
@@ -33,7 +33,8 @@ def render(job: RenderJob) -> RenderOutput:
     layers = (*_fields(job.splats), *_fields(job.static))
     behind = job.background, job.static_light
     drawn = _Rasterize.apply(job, job.camera.world_to_camera, *behind, *layers)
-    return RenderOutput(*drawn)
+    image, alpha, radii, static_radii, *pictures = drawn
+    return RenderOutput(image, alpha, radii, static_radii, by_group(pictures, job.times))
 
 
 def rows_in_view(
@@ -80,9 +81,7 @@ def _plain(tensor: Tensor | None) -> Tensor | None:
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, job: RenderJob, *inputs: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(ctx: Any, job: RenderJob, *inputs: Tensor | None) -> tuple[Tensor, ...]:
         camera, times = job.camera, job.times
         backdrop = None if job.static is None else job.backdrop
         pose, background, light, *layers = map(_plain, inputs)
@@ -109,26 +108,33 @@ class _Rasterize(torch.autograd.Function):
         # Planar in memory, which is what the kernels and convolutions like.
         image = image.permute(0, 2, 3, 1)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(radii, static_radii)
+        pictures = pictures_of(image, job.groups) if job.groups else ()
+        # Gradients of pictures are read where they are: to put them into one of the image first
+        # takes as long as many a loss.
+        ctx.groups = job.groups or (channels.shape[2],)
+        ctx.mark_non_differentiable(*(image,) * bool(pictures), radii, static_radii)
         ctx.kept = kept
         ctx.save_for_backward(*inputs)
-        return image, alpha, radii, static_radii
+        return image, alpha, radii, static_radii, *pictures
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> Any:
         # Reading saved_tensors also refuses inputs that were changed in place since.
         inputs, needed = ctx.saved_tensors, ctx.needs_input_grad[1:]
-        image_grad, alpha_grad, *_ = upstream
-        if image_grad is None and alpha_grad is None:
+        image_grad, alpha_grad, _, _, *above = upstream
+        if image_grad is not None:
+            above = list(image_grad)
+        if alpha_grad is None and all(gradient is None for gradient in above):
             return (None,) * (1 + len(inputs))
+        groups = ctx.groups if above else ()
         _, background, light, *layers = [
             torch.zeros(tensor.shape) if tensor is not None and need else None
             for tensor, need in zip(inputs, needed, strict=True)
         ]
         view = torch.zeros(12) if needed[0] else None
         moving, static = layers[:_FIELDS], layers[_FIELDS:]
-        ctx.kept.backward(image_grad, alpha_grad, moving, static, view, background, light)
+        ctx.kept.backward(above, groups, alpha_grad, moving, static, view, background, light)
         pose = None
         if view is not None:
             pose = torch.zeros(4, 4)

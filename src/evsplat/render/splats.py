@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+Picture = TypeVar("Picture", bound=Tensor | None)
 LOW_PASS = 0.3
 """Low-pass filter of 3DGS and most viewers, px^2: see `render`."""
 
@@ -94,6 +95,8 @@ class RenderOutput:
     """Radius on the screen in pixels, rounded up; 0 = not drawn."""
     static_radii: Int[Tensor, "1 S"]
     """The same of the static Gaussians."""
+    groups: tuple[tuple[Float[Tensor, "H W c"], ...], ...] = ()
+    """Per group of channels that was asked for its picture at each time, views of ``image``."""
 
 
 def split_channels(
@@ -101,11 +104,21 @@ def split_channels(
 ) -> tuple[tuple[Float[Tensor, "H W c"], ...], ...]:
     """Pictures of all times per group of channels, as views.
 
-    Their gradients are put into one tensor, planar as the rasteriser's pictures are, in one pass.
+    Their gradients are put into one tensor in few operations, which a GPU counts.
     """
-    parts = _SplitChannels.apply(images, tuple(sizes))
-    times = len(images)
-    return tuple(tuple(parts[k : k + times]) for k in range(0, len(parts), times))
+    return by_group(_SplitChannels.apply(images, tuple(sizes)), len(images))
+
+
+def by_group(pictures: Sequence[Picture], times: int) -> tuple[tuple[Picture, ...], ...]:
+    """Pictures of all times of the first group, all of the second, ... per group."""
+    return tuple(tuple(pictures[k : k + times]) for k in range(0, len(pictures), times))
+
+
+def pictures_of(
+    images: Float[Tensor, "T H W C"], sizes: Sequence[int]
+) -> tuple[Float[Tensor, "H W c"], ...]:
+    """Views of all times of the first group of channels, of all of the second, ..."""
+    return tuple(part[t] for part in images.split(tuple(sizes), -1) for t in range(len(images)))
 
 
 class _SplitChannels(torch.autograd.Function):
@@ -113,7 +126,7 @@ class _SplitChannels(torch.autograd.Function):
     def forward(ctx: Any, images: Tensor, sizes: tuple[int, ...]) -> tuple[Tensor, ...]:
         ctx.set_materialize_grads(False)
         ctx.shape, ctx.sizes = images.shape, sizes
-        return tuple(part[t] for part in images.split(sizes, -1) for t in range(len(images)))
+        return pictures_of(images, sizes)
 
     @staticmethod
     @once_differentiable
@@ -121,22 +134,12 @@ class _SplitChannels(torch.autograd.Function):
         given = next((part for part in upstream if part is not None), None)
         if given is None:
             return None, None
-        times, height, width, channels = ctx.shape
-        if given.device.type != "cpu":
-            # A GPU counts operations, and takes any layout.
-            starts = range(0, len(upstream), times)
-            return torch.cat(
-                [
-                    _stacked(upstream[k : k + times], given.new_zeros(height, width, size))
-                    for k, size in zip(starts, ctx.sizes, strict=True)
-                ],
-                -1,
-            ), None
-        gradient = given.new_empty(times, channels, height, width).permute(0, 2, 3, 1)
-        parts = [part[t] for part in gradient.split(ctx.sizes, -1) for t in range(times)]
-        for part, value in zip(parts, upstream, strict=True):
-            part.zero_() if value is None else part.copy_(value)
-        return gradient, None
+        times, height, width, _ = ctx.shape
+        gradients = [
+            _stacked(group, given.new_zeros(height, width, size))
+            for group, size in zip(by_group(upstream, times), ctx.sizes, strict=True)
+        ]
+        return torch.cat(gradients, -1), None
 
 
 def _stacked(pictures: Sequence[Tensor | None], nothing: Tensor) -> Float[Tensor, "T H W c"]:
