@@ -110,6 +110,21 @@ struct BackwardJob {
     float* light_grad;            // (H, W), written; null: not wanted
 };
 
+// A tile where nothing moves, drawn without light, and its pictures under the lights of their times.
+struct LightTile {
+    const View* view;
+    int channels;
+    const float *light, *unlit;  // (T, H, W) and (kLitChannels, H, W)
+    float* image;                // (T, channels, H, W)
+};
+
+// Of the pictures, of channel k at time t at of_image[t * channels + k], and of alpha; null: zero. What is written:
+// their sums over the times, (channels, tile) and (tile), of the picture without light; (T, H, W) of the lights, or null.
+struct LightTileGrads {
+    const PlaneGrad *of_image, *of_alpha;
+    float *image, *alpha, *light;
+};
+
 struct PairOfSums {
     double first, second;
 };
@@ -127,6 +142,9 @@ struct GaussianGrads {
     KERNEL(void, project, (const View&, const Gaussians&, uint32_t begin, uint32_t end, Projected*, int32_t* radii, uint32_t* first_slot, List<Slot>&)) \
     /* Sums the slots of each Gaussian of [begin, end) and goes back through the projection. */ \
     KERNEL(void, project_backward, (const View&, const Gaussians&, uint32_t begin, uint32_t end, const Projected*, const uint32_t* first_slot, const float* slots, int channels, const GaussianGrads&)) \
+    /* Multiplies pictures that are there without light by their lights. */ \
+    KERNEL(void, light_tile, (const LightTile&, const TileWork&)) \
+    KERNEL(void, light_tile_backward, (const LightTile&, const LightTileGrads&, const TileWork&)) \
     KERNEL(void, mlp_forward, (const MlpShape&, const MlpForward&, size_t block, float* scratch)) \
     KERNEL(void, mlp_backward, (const MlpShape&, const MlpBackward&, size_t block, const MlpSums&, float* scratch)) \
     /* Sums over a band, and the gradient of the similarity. */ \
@@ -151,7 +169,7 @@ struct GaussianGrads {
     KERNEL(void, sh_rows, (const ShRows&, size_t begin, size_t end)) \
     KERNEL(void, tree_softmax, (const TreeSoftmax&, size_t begin, size_t end, float* scratch)) \
     /* Points [begin, end). */ \
-    KERNEL(void, skin, (const Skinning&, size_t begin, size_t end, float* moved, float* blended, float* linear)) \
+    KERNEL(void, skin, (const Skinning&, size_t begin, size_t end, Hangs* scratch, float* moved, float* blended, float* linear)) \
     KERNEL(void, skin_backward, (const Skinning&, const SkinningGrads&, const float* blended, size_t begin, size_t end)) \
     KERNEL(void, surface_light, (const SurfaceLight&, size_t begin, size_t end, float* factors)) \
     /* Sums over the points, and the gradient of the shares unless `lit` is null. */ \

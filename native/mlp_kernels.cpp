@@ -68,9 +68,9 @@ INLINE auto to_panels(float* to) {
     };
 }
 
-// sum (x panels, y columns, lanes) += y^T x over the rows of both; y has `y_panels`.
-INLINE void add_outer(const float* y, int y_panels, const float* x, int x_panels, float* sum) {
-    const int columns = y_panels * W;
+// sum (x panels, columns of y's panels, lanes) += y^T x over the rows of both; of y only `used` columns.
+INLINE void add_outer(const float* y, int used, const float* x, int x_panels, float* sum) {
+    const int columns = (used + W - 1) / W * W;
     const auto tile = [&](auto together, int p, int column) {
         constexpr int n = decltype(together)::value;
         F sums[2][kTileRows];
@@ -86,9 +86,9 @@ INLINE void add_outer(const float* y, int y_panels, const float* x, int x_panels
     };
     int p = 0;
     for (; p + 2 <= x_panels; p += 2)
-        for (int column = 0; column < columns; column += kTileRows) tile(Count<2>{}, p, column);
+        for (int column = 0; column < used; column += kTileRows) tile(Count<2>{}, p, column);
     if (p < x_panels)
-        for (int column = 0; column < columns; column += kTileRows) tile(Count<1>{}, p, column);
+        for (int column = 0; column < used; column += kTileRows) tile(Count<1>{}, p, column);
 }
 
 INLINE void add_column_sums(const float* x, int panels, float* sum) {
@@ -133,7 +133,7 @@ INLINE void to_first_layer(const MlpShape& s, const MlpBackward& job, size_t fir
     if (!f.both) return;
     const size_t offset = t * s.points * s.per_both;
     pack(f.both + offset, first, s.points, s.per_both, s.both_panels, both);
-    add_outer(y, s.width_panels, both, s.both_panels, sums.both_weight);
+    add_outer(y, s.width, both, s.both_panels, sums.both_weight);
     if (!job.both_grad) return;
     const auto zero = [](int, int) { return F{}; };
     rows_times(y, s.width, f.both_weight.backward, s.both_panels, zero, to_panels(both));
@@ -143,7 +143,7 @@ INLINE void to_first_layer(const MlpShape& s, const MlpBackward& job, size_t fir
 // The sum `y` of that gradient over the times, to what is given per point; `point` holds that.
 INLINE void to_points(const MlpShape& s, const MlpBackward& job, size_t first, const float* y, float* point,
                       const MlpSums& sums) {
-    add_outer(y, s.width_panels, point, s.point_panels, sums.point_weight);
+    add_outer(y, s.width, point, s.point_panels, sums.point_weight);
     if (!job.point_grad) return;
     const auto zero = [](int, int) { return F{}; };
     rows_times(y, s.width, job.forward.point_weight.backward, s.point_panels, zero, to_panels(point));
@@ -218,7 +218,7 @@ void mlp_backward(const MlpShape& s, const MlpBackward& job, size_t block, const
         for (int l = s.layers - 1; l >= 0; --l) {
             const float* x = kept + l * matrix;
             float* next = l ? turns + l % 2 * matrix : flow;
-            add_outer(y, s.panels(l), x, s.width_panels, sums.weight[l]);
+            add_outer(y, s.columns(l), x, s.width_panels, sums.weight[l]);
             add_column_sums(y, s.panels(l), sums.layer_bias[l]);
             const auto end = [&](int p, int r, F a, F b) {
                 const float* seen = x + p * kPanel + r * W;

@@ -274,61 +274,8 @@ void copy_tile(const View& view, uint32_t tile, size_t planes, const float* from
         }
 }
 
-// Calls f(at, count) for the rows of a tile, `at` being the pixel that a row begins with.
-template <class F>
-void for_rows(const View& view, uint32_t tile, F f) {
-    const size_t width = view.width, x = tile % view.tiles_x * kTile, y = tile / view.tiles_x * kTile;
-    const size_t columns = std::min<size_t>(kTile, width - x), rows = std::min<size_t>(kTile, view.height - y);
-    for (size_t row = y; row < y + rows; ++row) f(row, row * width + x, columns);
-}
-
-// A tile where nothing moves, drawn without light, to its times under their lights.
-void light_tile(const Scene& s, const TileWork& work, float* image) {
-    const size_t pixels = size_t(s.view.width) * s.view.height;
-    for (uint32_t i = 0; i < work.time_count; ++i)
-        for_rows(s.view, work.index, [&](size_t, size_t at, size_t columns) {
-            const float* light = s.light + work.times[i] * pixels + at;
-            for (int k = 0; k < kLitChannels; ++k) {
-                float* to = image + (size_t(work.times[i]) * s.channels + k) * pixels + at;
-                for (size_t x = 0; x < columns; ++x) to[x] *= light[x];
-            }
-        });
-}
-
-// The gradient of such a tile: the image's (channels, tile) and the alpha's (tile), summed over the times, of the
-// picture without light; and that of the lights.
-void light_tile_backward(const Scene& s, const Record& r, const TileWork& work, const OutputGrads& out, float* image,
-                         float* alpha, float* light_grad) {
-    const size_t pixels = size_t(s.view.width) * s.view.height;
-    std::fill_n(image, s.channels * kTilePixels, 0.f);
-    std::fill_n(alpha, kTilePixels, 0.f);
-    const size_t left = work.index % s.view.tiles_x * kTile, top = work.index / s.view.tiles_x * kTile;
-    for (uint32_t i = 0; i < work.time_count; ++i)
-        for_rows(s.view, work.index, [&](size_t row, size_t at, size_t columns) {
-            const ptrdiff_t t = work.times[i];
-            const size_t to = (row - top) * kTile;
-            float given[kTile], by_light[kTile] = {};
-            const auto load = [&](const PlaneGrad& plane) {
-                const float* from = plane.data + ptrdiff_t(row) * plane.down + ptrdiff_t(left) * plane.right;
-                for (size_t x = 0; plane.data && x < columns; ++x) given[x] = from[ptrdiff_t(x) * plane.right];
-                return plane.data != nullptr;
-            };
-            if (!out.alpha.empty() && load(out.alpha[t]))
-                for (size_t x = 0; x < columns; ++x) alpha[to + x] += given[x];
-            const float* light = s.light + size_t(t) * pixels + at;
-            for (int k = 0; k < s.channels && !out.image.empty(); ++k) {
-                if (!load(out.image[t * s.channels + k])) continue;
-                float* sum = image + k * kTilePixels + to;
-                if (k >= kLitChannels) {
-                    for (size_t x = 0; x < columns; ++x) sum[x] += given[x];
-                    continue;
-                }
-                const float* unlit = r.unlit.data() + k * pixels + at;
-                for (size_t x = 0; x < columns; ++x) sum[x] += given[x] * light[x];
-                for (size_t x = 0; x < columns; ++x) by_light[x] += given[x] * unlit[x];
-            }
-            if (light_grad) std::copy_n(by_light, columns, light_grad + size_t(t) * pixels + at);
-        });
+LightTile lit(const Scene& s, const Record& r, float* image) {
+    return {&s.view, s.channels, s.light, r.unlit.data(), image};
 }
 
 size_t bytes_of(const Binned& d) {
@@ -422,7 +369,7 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, s
                     copy_tile(s.view, tile, s.channels, still.image.data(), image + t * s.channels * pixels);
                     copy_tile(s.view, tile, 1, still.alpha.data(), alpha + t * pixels);
                 }
-                if (s.light) light_tile(s, work, image);
+                if (s.light) r.kernels->light_tile(lit(s, r, image), work);
                 return;
             }
             for (int c = 0; c < s.channels; c += kMaxChannels) {
@@ -440,7 +387,7 @@ std::unique_ptr<Record> render_forward(const Scene& s, int threads, bool keep, s
             }
             if (s.light && work.bare) {
                 copy_tile(s.view, tile, kLitChannels, image + work.times[0] * s.channels * pixels, r.unlit.data());
-                light_tile(s, work, image);
+                r.kernels->light_tile(lit(s, r, image), work);
             }
         });
     };
@@ -489,7 +436,8 @@ void render_backward(const Scene& s, const Record& r, int threads, const OutputG
                     thread_local std::vector<float> grads;
                     grads.resize(size_t(s.channels + 1) * kTilePixels);
                     float* alpha = grads.data() + s.channels * kTilePixels;
-                    light_tile_backward(s, r, work, out, grads.data(), alpha, in.light);
+                    const LightTileGrads to = {job.image_grad, job.alpha_grad, grads.data(), alpha, in.light};
+                    kernels.light_tile_backward(lit(s, r, nullptr), to, work);
                     const ptrdiff_t first = tile / s.view.tiles_x * kTile * kTile + tile % s.view.tiles_x * kTile;
                     for (int k = 0; k < channels; ++k) summed[k] = {grads.data() + k * kTilePixels - first, kTile, 1};
                     summed[channels] = {alpha - first, kTile, 1};

@@ -13,7 +13,10 @@ static constexpr size_t kLanes = 16;
 
 void skin(const Skinning& s, int threads, float* moved, float* blended, float* linear) {
     const auto kernel = select_kernels().skin;
-    in_pieces(threads, s.points, kPoints, [&](size_t begin, size_t end) { kernel(s, begin, end, moved, blended, linear); });
+    in_pieces(threads, s.points, kPoints, [&](size_t begin, size_t end) {
+        Buffer<Hangs> hangs(kLookedUp * s.joints);
+        kernel(s, begin, end, hangs.data(), moved, blended, linear);
+    });
 }
 
 void skin_backward(const Skinning& s, const float* blended, SkinningGrads g, int threads) {

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <stddef.h>
+#include <stdint.h>
 
 namespace evsplat {
 
@@ -12,6 +13,14 @@ struct Skinning {
     size_t position_step, weight_step;
     const float* bones;                     // (T, J, 16), row-major 4x4
 };
+
+// A joint that a point hangs on.
+struct Hangs {
+    uint32_t joint;
+    float weight;
+};
+
+constexpr size_t kLookedUp = 64;  // points whose joints are looked up once for all times
 
 // What a block of points does; `bones_columns` are the bones as (T, 12, padded J).
 struct SkinningGrads {

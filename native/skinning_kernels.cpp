@@ -25,36 +25,56 @@ INLINE void for_joints(const float* weight, size_t joints, Function f) {
     }
 }
 
+// Calls f(n, hangs, hangs_end) for points [begin, end) with the joints of `hangs` that each hangs on.
+template <class Function>
+INLINE void for_points(size_t begin, size_t end, const Hangs* hangs, const uint32_t* ends, Function f) {
+    const Hangs* at = hangs;
+    for (size_t n = begin; n < end; at = hangs + ends[n++ - begin]) f(n, at, hangs + ends[n - begin]);
+}
+
 }  // namespace
 
-void skin(const Skinning& s, size_t begin, size_t end, float* moved, float* blended, float* linear) {
-    for (size_t t = 0; t < s.times; ++t) {
-        const float* bones = s.bones + t * s.joints * 16;
-        for (size_t n = begin; n < end; ++n) {
-            const float* weight = s.weight + t * s.weight_step + n * s.joints;
-            F sum[V] = {};
-            for_joints(weight, s.joints, [&](size_t j) { add_matrix(sum, weight[j], bones + 16 * j); });
-            float b[16];
-            __builtin_memcpy(b, sum, sizeof b);
-            __builtin_memcpy(blended + (t * s.points + n) * 16, b, sizeof b);
-            for (int r = 0; linear && r < 3; ++r)
-                __builtin_memcpy(linear + (t * s.points + n) * 9 + 3 * r, b + 4 * r, 3 * sizeof *b);
-            const float* p = s.position + t * s.position_step + n * 3;
-            for (int r = 0; r < 3; ++r)
-                moved[(t * s.points + n) * 3 + r] = b[4 * r] * p[0] + b[4 * r + 1] * p[1] + b[4 * r + 2] * p[2] + b[4 * r + 3];
+void skin(const Skinning& s, size_t begin, size_t end, Hangs* hangs, float* moved, float* blended, float* linear) {
+    const size_t alike = s.weight_step ? 1 : s.times;  // times with the same weights
+    uint32_t ends[kLookedUp];
+    for (size_t first = 0; first < s.times; first += alike)
+        for (size_t from = begin, to; from < end; from = to) {
+            to = end - from < kLookedUp ? end : from + kLookedUp;
+            uint32_t count = 0;
+            for (size_t n = from; n < to; ++n) {
+                const float* weight = s.weight + first * s.weight_step + n * s.joints;
+                for_joints(weight, s.joints, [&](size_t j) { hangs[count++] = {uint32_t(j), weight[j]}; });
+                ends[n - from] = count;
+            }
+            for (size_t t = first; t < first + alike; ++t) {
+                const float* bones = s.bones + t * s.joints * 16;
+                for_points(from, to, hangs, ends, [&](size_t n, const Hangs* at, const Hangs* last) {
+                    F sum[V] = {};
+                    for (; at < last; ++at) add_matrix(sum, at->weight, bones + 16 * at->joint);
+                    float b[16];
+                    __builtin_memcpy(b, sum, sizeof b);
+                    __builtin_memcpy(blended + (t * s.points + n) * 16, b, sizeof b);
+                    for (int r = 0; linear && r < 3; ++r)
+                        __builtin_memcpy(linear + (t * s.points + n) * 9 + 3 * r, b + 4 * r, 3 * sizeof *b);
+                    const float* p = s.position + t * s.position_step + n * 3;
+                    for (int r = 0; r < 3; ++r)
+                        moved[(t * s.points + n) * 3 + r] =
+                            b[4 * r] * p[0] + b[4 * r + 1] * p[1] + b[4 * r + 2] * p[2] + b[4 * r + 3];
+                });
+            }
         }
-    }
 }
 
 void skin_backward(const Skinning& s, const SkinningGrads& g, const float* blended, size_t begin, size_t end) {
+    const bool by_rows = g.weight || g.bones;  // who reads the blended matrix's gradient
     for (size_t t = 0; t < s.times; ++t)
         for (size_t n = begin; n < end; ++n) {
             const float* p = s.position + t * s.position_step + n * 3;
             const float* b = blended + (t * s.points + n) * 16;
             // Rows of the blended matrix's gradient; narrow vectors, which are read back as they were written.
             F4 by_row[4] = {}, by_position = {};
-            if (g.blended) __builtin_memcpy(by_row, g.blended + (t * s.points + n) * 16, sizeof by_row);
-            if (g.linear) {
+            if (by_rows && g.blended) __builtin_memcpy(by_row, g.blended + (t * s.points + n) * 16, sizeof by_row);
+            if (by_rows && g.linear) {
                 const float* v = g.linear + (t * s.points + n) * 9;
                 for (int r = 0; r < 3; ++r) by_row[r] += F4{v[3 * r], v[3 * r + 1], v[3 * r + 2], 0.f};
             }

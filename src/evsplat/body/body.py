@@ -154,6 +154,7 @@ class _PlainSkin(torch.autograd.Function):
         blended = (weights @ bones.flatten(-2)).unflatten(-1, (4, 4))
         linear = blended[..., :3, :3]
         moved = (linear * points[..., None, :]).sum(-1) + blended[..., :3, 3]
+        _without_gradient_of_points(ctx, blended, linear)
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(points, weights, bones, blended)
         return moved, blended, linear
@@ -182,6 +183,13 @@ class _PlainSkin(torch.autograd.Function):
         )
 
 
+def _without_gradient_of_points(ctx: Any, *matrices: Tensor) -> None:
+    """Points move the points alone: nobody then works out what the matrices' gradients are."""
+    _, to_weights, to_bones, *_ = ctx.needs_input_grad
+    if not (to_weights or to_bones):
+        ctx.mark_non_differentiable(*matrices)
+
+
 class _NativeSkin(torch.autograd.Function):
     """`skin` in the compiled module; points and weights have a leading axis of T or 1."""
 
@@ -194,6 +202,7 @@ class _NativeSkin(torch.autograd.Function):
         moved, blended = bones.new_empty(times, count, 3), bones.new_empty(times, count, 4, 4)
         linear = bones.new_empty(times, count, 3, 3) if with_linear else None
         native.skin(*given, moved, blended, linear, torch.get_num_threads())
+        _without_gradient_of_points(ctx, blended, *(() if linear is None else (linear,)))
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*given, blended)
         return moved, blended, linear
