@@ -1,6 +1,7 @@
 #include "mlp.h"
 
 #include <algorithm>
+#include <functional>
 #include <stdexcept>
 #include <utility>
 
@@ -25,6 +26,14 @@ void to_panels(const float* from, int rows, int columns, int row_step, int colum
             }
 }
 
+// Copies of matrices that wait for each other's places to be known: made one by one they leave all threads but one idle
+// for as long as a small network takes.
+using Copies = std::vector<std::function<void()>>;
+
+void make(const Copies& copies, int threads) {
+    parallel_for(threads, copies.size(), [&](size_t i) { copies[i](); });
+}
+
 // Hands out consecutive pieces of one buffer; without one it counts their floats.
 struct Pieces {
     float* buffer = nullptr;
@@ -40,12 +49,12 @@ size_t weight_floats(int out, int in, int lanes) {
     return size_t(panels_of(out, lanes)) * lanes * (in + 1) + size_t(panels_of(in, lanes)) * lanes * out;
 }
 
-MlpWeight pack_weight(const float* weight, const float* bias, int out, int in, int lanes, Pieces& pieces) {
+MlpWeight pack_weight(const float* weight, const float* bias, int out, int in, int lanes, Pieces& pieces, Copies& copies) {
     float* forward = pieces.take(size_t(panels_of(out, lanes)) * lanes * in);
     float* backward = pieces.take(size_t(panels_of(in, lanes)) * lanes * out);
     float* padded = pieces.take(size_t(panels_of(out, lanes)) * lanes);
-    to_panels(weight, in, out, 1, in, lanes, forward);
-    to_panels(weight, out, in, in, 1, lanes, backward);
+    copies.push_back([=] { to_panels(weight, in, out, 1, in, lanes, forward); });
+    copies.push_back([=] { to_panels(weight, out, in, in, 1, lanes, backward); });
     if (bias) to_panels(bias, 1, out, 0, 1, lanes, padded);
     return {forward, backward, padded};
 }
@@ -68,8 +77,8 @@ MlpSums sums_in(const MlpShape& s, Pieces& pieces) {
 void from_panels(const float* from, int out, int in, int lanes, float* to) {
     const int rows = panels_of(out, lanes) * lanes;
     for (int o = 0; o < out; ++o)
-        for (int i = 0; i < in; ++i)
-            to[size_t(o) * in + i] = from[(size_t(i / lanes) * rows + o) * lanes + i % lanes];
+        for (int i = 0; i < in; i += lanes)
+            std::copy_n(from + (size_t(i / lanes) * rows + o) * lanes, std::min(lanes, in - i), to + size_t(o) * in + i);
 }
 
 }  // namespace
@@ -89,18 +98,20 @@ Mlp::Mlp(const MlpInputs& inputs, bool keep, int threads)
 }
 
 // The weights as the kernels take them, for both directions.
-static MlpForward pack_weights(const MlpInputs& in, const MlpShape& s, Buffer<float>& packed) {
+static MlpForward pack_weights(const MlpInputs& in, const MlpShape& s, int threads, Buffer<float>& packed) {
     size_t floats = weight_floats(s.width, s.per_point, s.lanes) + weight_floats(s.width, s.per_both, s.lanes) +
                     s.times * s.width_panels * s.lanes;
     for (int l = 0; l < s.layers; ++l) floats += weight_floats(s.columns(l), s.width, s.lanes);
     packed.reset(floats);
     Pieces pieces{packed.data()};
+    Copies copies;
     MlpForward job = {};
     job.point = in.point, job.both = in.both;
-    job.point_weight = pack_weight(in.point_weight, nullptr, s.width, s.per_point, s.lanes, pieces);
-    job.both_weight = pack_weight(in.both_weight, nullptr, s.width, s.per_both, s.lanes, pieces);
+    job.point_weight = pack_weight(in.point_weight, nullptr, s.width, s.per_point, s.lanes, pieces, copies);
+    job.both_weight = pack_weight(in.both_weight, nullptr, s.width, s.per_both, s.lanes, pieces, copies);
     for (int l = 0; l < s.layers; ++l)
-        job.layer[l] = pack_weight(in.weights[l], in.biases[l], s.columns(l), s.width, s.lanes, pieces);
+        job.layer[l] = pack_weight(in.weights[l], in.biases[l], s.columns(l), s.width, s.lanes, pieces, copies);
+    make(copies, threads);
     float* bias = pieces.take(s.times * s.width_panels * s.lanes);
     for (size_t t = 0; t < s.times; ++t)
         to_panels(in.bias + t * s.width, 1, s.width, 0, 1, s.lanes, bias + t * s.width_panels * s.lanes);
@@ -158,7 +169,7 @@ void Mlp::forward(float* output) {
         });
         return;
     }
-    job_ = pack_weights(in_, shape_, packed_);
+    job_ = pack_weights(in_, shape_, threads_, packed_);
     if (shape_.keep) activations_.reset(shape_.blocks * shape_.times * shape_.kept());
     job_.activations = activations_.data(), job_.output = output;
     parallel_for(threads_, shape_.blocks, [&](size_t block) {
@@ -174,7 +185,8 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
 
     // On AMX as many points a group, since blocks are twice as large.
     const size_t per_group = kernels_.tiles ? kBlocksPerGroup / 2 : kBlocksPerGroup;
-    const size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / per_group));
+    size_t groups = std::max<size_t>(1, std::min(kMostGroups, s.blocks / per_group));
+    if (groups > 4) groups -= groups % 4;  // as many for each of two or four threads
     Pieces counted;
     sums_in(s, counted);
     const size_t floats = counted.taken;
@@ -197,14 +209,19 @@ void Mlp::backward(const float* output_grad, const MlpGrads& grads) {
     });
     Pieces first{sums.data()};
     const MlpSums total = sums_in(s, first);
-    from_panels(total.point_weight, s.width, s.per_point, s.lanes, grads.point_weight);
-    if (in_.both) from_panels(total.both_weight, s.width, s.per_both, s.lanes, grads.both_weight);
+    Copies copies;
+    const auto copy = [&](const float* from, int out, int in, float* to) {
+        copies.push_back([=, &s] { from_panels(from, out, in, s.lanes, to); });
+    };
+    copy(total.point_weight, s.width, s.per_point, grads.point_weight);
+    if (in_.both) copy(total.both_weight, s.width, s.per_both, grads.both_weight);
     for (size_t t = 0; t < s.times; ++t)
         std::copy_n(total.bias + t * s.width_panels * s.lanes, s.width, grads.bias + t * s.width);
     for (int l = 0; l < s.layers; ++l) {
-        from_panels(total.weight[l], s.columns(l), s.width, s.lanes, grads.weights[l]);
+        copy(total.weight[l], s.columns(l), s.width, grads.weights[l]);
         std::copy_n(total.layer_bias[l], s.columns(l), grads.biases[l]);
     }
+    make(copies, threads_);
 }
 
 }  // namespace evsplat
