@@ -25,7 +25,7 @@ def test_a_crate_is_nearer_than_the_wall_behind_it(seed, roll):
     wrong = (shares * bare / depth - 1).abs()
     assert (bare / depth - 1)[there].median() > 0.1
     assert wrong[there].median() < 0.06
-    assert (shares[~there] == 1).float().mean() > 0.97
+    assert (shares[~there] == 1).float().mean() > 0.995
 
 
 @pytest.mark.parametrize("seed", range(4))

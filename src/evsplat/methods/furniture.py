@@ -1,47 +1,49 @@
 """What stands on the floor before the walls of a known room, and how far away, by one picture.
 
-It looks neither like the floor nor like the walls. What is upright is as far away as where it meets
-the floor (Hoiem, Efros and Hebert, Automatic Photo Pop-up, SIGGRAPH 2005); as seats and table tops
-lead back to the wall, its upper end is taken to be half as far before it.
+It looks neither like the floor nor like the walls, ends at edges, and its neighbouring columns end
+at about the same heights. What is upright is as far away as where it meets the floor (Hoiem, Efros
+and Hebert, Automatic Photo Pop-up, SIGGRAPH 2005); as seats and table tops lead back to the wall,
+its upper end is taken to be half as far before it.
 """
 
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_dilation, binary_opening, gaussian_filter, label, maximum_filter
+from scipy.ndimage import binary_dilation, maximum_filter
 from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.gaussians.initialise import pixel_rays
 from evsplat.methods.background import gone_on
 from evsplat.methods.colour_shares import ColourShares
-from evsplat.methods.line_directions import level_axes
+from evsplat.methods.line_directions import Lines, level_axes
 from evsplat.methods.plane_sweep import enlarged, pooled
 from evsplat.methods.room import Room, from_feet_m
+from evsplat.methods.stixels import stixels
 
 SIDE_PX = 128
 """Shorter side, about, of the picture that is looked at."""
 _ROUNDS = 3
-_SURE, _PRICE, _ANYTHING = 4.0, 0.5, 0.1
+_SURE, _PRICE, _ANYTHING = 3.0, 0.8, 0.1
 """Most that a pixel's colour says, as a logarithm of likelihoods, what furniture costs, and the
 share of floor and walls that may look otherwise."""
-_REACHES_M = 0.4, 0.7, 1.0
-"""Ways from the feet in which the floor's colours count 1 / e as much."""
+_EDGE, _USUAL = 8.0, 0.7
+"""Worth of an edge at a foot or an upper end, and how much of one makes an end neither likelier nor
+less likely."""
+_RISE_M = 0.2
+"""Least height at which a thing ends before the wall: skirting boards are lower."""
+_REACH_M = 0.7
+"""Way from the feet in which the floor's colours count 1 / e as much."""
 _FAR = 2.0
 """Weight of the floor far from the feet once things are known; what is near has 1 more."""
-_BLUR_PX = 1.2
-_LEAST_PX = 20
-"""Of a thing, before the floor."""
 _CLEARANCE, _BODY_PX = 1.03, 7
 """Least depth of a thing as a share of the body's, and the square over which one of its points
 counts."""
 _RIM_PX, _CELL_PX, _WIDTH = 2, 2, 0.75
 """Width of a thing's rim, whose colours are in part its own; side of the squares of what is behind
 it, of which each has a Gaussian, and its standard deviation in them."""
-_GAP, _LEAST_ROWS = 3, 4
-"""Rows without it that a thing may have, and that it must have."""
 _LEADS_BACK = 0.5
 """Share of the way to the wall that its upper end is farther than its foot, in inverse depth."""
 
@@ -56,7 +58,8 @@ def furnished(
     """
     step = max(1, round(min(camera.width, camera.height) / SIDE_PX))
     view = camera.smaller(step, whole=False)
-    shares = _likeliest(pooled(picture, step).double().numpy(), room, view)
+    lines = Lines.of(pooled(picture, step).double().numpy(), view)
+    shares = _shares(lines, room)
     least = _CLEARANCE * _farthest_m(body, view) / room.depth(view)
     shares = torch.maximum(shares, least).clamp_max(1)
     return enlarged(shares, step)[: camera.height, : camera.width]
@@ -93,96 +96,91 @@ def _farthest_m(body: Float[Tensor, "N 3"], view: Camera) -> Float[Tensor, "H W"
     return torch.from_numpy(spread)
 
 
-def _likeliest(
-    picture: Float[np.ndarray, "H W 3"], room: Room, view: Camera
-) -> Float[Tensor, "H W"]:
-    """Shares of the things that explain the picture's colours best.
-
-    Somebody may have stood near a thing or far from it, so that several ways from the feet are
-    tried in which there is surely floor.
-    """
-    planes = room.inverse(view.center(), pixel_rays(view))
-    floor = (planes.argmax(-1) == 0).numpy()
-    feet_m = from_feet_m(view, planes[..., 0], room.feet, room.up)
-    colours = ColourShares(picture)
-    above = (planes[..., 0] < 0).numpy()
-    told = (_told(colours, floor, np.exp(-feet_m / reach), above) for reach in _REACHES_M)
-    found = [_shares(things, view, room) for things in told]
-    return max(found, key=lambda shares: _explained(colours, floor, (shares < 1).numpy()))
-
-
-def _told(
-    colours: ColourShares,
-    floor: Bool[np.ndarray, "H W"],
-    near: Float[np.ndarray, "H W"],
-    above: Bool[np.ndarray, "H W"],
-) -> Bool[np.ndarray, "H W"]:
-    """Things, where at first floor is what is ``near`` the feet, and wall what is above the camera.
-
-    Colours of the three are found anew from round to round.
-    """
-    anything = colours.of(np.ones(floor.shape))
-    things, thing = np.zeros_like(floor), anything
-    surely, wall = near, above
-    for _ in range(_ROUNDS):
-        empty = np.where(floor, colours.of(surely * floor), colours.of(1.0 * wall))
-        unlike = np.log(thing + 1e-9) - np.log((1 - _ANYTHING) * empty + 1e-9)
-        unlike = gaussian_filter(np.clip(unlike, -_SURE, _SURE), _BLUR_PX) - _PRICE
-        things = _standing(binary_opening(unlike > 0, np.ones((2, 2))), floor)
-        thing = 0.5 * (colours.of(1.0 * things) + anything)
-        surely, wall = (near + _FAR) * ~things, ~floor & ~things
-    return things
-
-
-def _explained(
-    colours: ColourShares, floor: Bool[np.ndarray, "H W"], things: Bool[np.ndarray, "H W"]
-) -> float:
-    """Logarithm of the likelihood of all colours in three parts of the picture."""
-    parts = things, floor & ~things, ~floor & ~things
-    told = sum(float(np.log(colours.of(1.0 * part)[part] + 1e-9).sum()) for part in parts)
-    return told - _PRICE * float(things.sum())
-
-
-def _standing(
-    things: Bool[np.ndarray, "H W"], floor: Bool[np.ndarray, "H W"]
-) -> Bool[np.ndarray, "H W"]:
-    """Those of which enough is seen before the floor."""
-    numbers, count = label(things, np.ones((3, 3)))
-    before_floor = np.bincount(numbers[floor], minlength=count + 1)
-    stands = before_floor >= _LEAST_PX
-    stands[0] = False
-    return stands[numbers]
-
-
-def _shares(things: Bool[np.ndarray, "H W"], view: Camera, room: Room) -> Float[Tensor, "H W"]:
+def _shares(lines: Lines, room: Room) -> Float[Tensor, "H W"]:
     """Depth of upright things as a share of the room's.
 
-    Of columns and rows of equal azimuth and of equal slope, in which what is upright stays in its
-    column, however the camera is held.
+    At first floor is what is near the feet, and wall what is above the camera; colours of both and
+    of things are found anew from round to round.
     """
-    rays, up = pixel_rays(view), room.up
-    right, ahead = level_axes(view, up, 0.0)
-    azimuths = torch.atan2(rays @ right, rays @ ahead)
-    slopes = -(rays @ up) / torch.hypot(rays @ right, rays @ ahead)
-    columns, column = _cells(azimuths, things.shape[1])
-    rows, row = _cells(slopes, things.shape[0])
-    level = columns.sin()[:, None] * right + columns.cos()[:, None] * ahead
-    directions = level - rows[:, None, None] * up
-    inverse = room.inverse(view.center(), directions)
-    nearest = inverse.amax(-1)
-    x, y, _, inside = view.pixels(view.center() + directions)
-    there = torch.from_numpy(things)[y, x] & inside
-    shares = torch.ones_like(nearest)
-    for at in range(len(columns)):
-        for top, foot in _runs(there[:, at].numpy()):
-            on_floor = inverse[foot].argmax(-1)[at] == 0 and inverse[top].argmax(-1)[at] > 0
-            if not on_floor:
-                continue
-            below = inverse[min(foot + 1, len(rows) - 1), at, 0]
-            back = _LEADS_BACK * torch.linspace(1, 0, foot - top + 1)
-            thing = torch.lerp(below, nearest[top, at], back)
-            shares[top : foot + 1, at] = (nearest[top : foot + 1, at] / thing).clamp_max(1)
-    return torch.where(torch.from_numpy(things), shares[row, column], 1.0)
+    view = lines.camera
+    planes = room.inverse(view.center(), pixel_rays(view))
+    floor = (planes.argmax(-1) == 0).numpy()
+    near = np.exp(-from_feet_m(view, planes[..., 0], room.feet, room.up) / _REACH_M)
+    colours, upright = ColourShares(lines.picture), _Upright.of(view, room)
+    edges = upright.seen(_EDGE * (lines.strength * (1 - lines.along(room.up)) - _USUAL))
+    edges = np.maximum(edges, np.concatenate([edges[1:], edges[-1:]]))
+    edges[-1] = 0  # What leaves the picture ends at no edge.
+    anything = colours.of(np.ones(floor.shape))
+    surely, wall, thing = near, 1.0 * (planes[..., 0] < 0).numpy(), anything
+    shares = torch.ones(floor.shape)
+    for _ in range(_ROUNDS):
+        empty = np.where(floor, colours.of(surely * floor), colours.of(wall))
+        unlike = np.log(thing + 1e-9) - np.log((1 - _ANYTHING) * empty + 1e-9)
+        gains = upright.seen(np.clip(unlike, -_SURE, _SURE) - _PRICE)
+        shares = upright.shares(gains, edges)
+        things = (shares < 1).numpy()
+        thing = 0.5 * (colours.of(1.0 * things) + anything)
+        surely, wall = (near + _FAR) * ~things, 1.0 * (~floor & ~things)
+    return shares
+
+
+@dataclass(frozen=True, eq=False)
+class _Upright:
+    """Columns of equal azimuth and rows of equal slope.
+
+    In them what is upright stays in its column, however the camera is held.
+    """
+
+    inverse: Float[np.ndarray, "H W P"]
+    """Inverse depth of the room's planes."""
+    risen: Bool[np.ndarray, "H W"]
+    """Higher than `_RISE_M` before what stands behind the floor."""
+    pixels: tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]
+    """Row and column of the picture at each place."""
+    inside: Bool[np.ndarray, "H W"]
+    """Whether the picture shows it."""
+    places: tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]
+    """Row and column here of each pixel."""
+
+    @staticmethod
+    def of(view: Camera, room: Room) -> "_Upright":
+        """As many of either as the picture has."""
+        rays, up = pixel_rays(view), room.up
+        right, ahead = level_axes(view, up, 0.0)
+        azimuths = torch.atan2(rays @ right, rays @ ahead)
+        slopes = -(rays @ up) / torch.hypot(rays @ right, rays @ ahead)
+        columns, column = _cells(azimuths, view.width)
+        rows, row = _cells(slopes, view.height)
+        level = columns.sin()[:, None] * right + columns.cos()[:, None] * ahead
+        directions = level - rows[:, None, None] * up
+        inverse = room.inverse(view.center(), directions).numpy()
+        x, y, _, inside = view.pixels(view.center() + directions)
+        height_m = float(room.offsets[0] - room.normals[0] @ view.center())
+        # Walls are upright: their inverse depth is the same in all of a column's rows.
+        lowest = inverse[..., 1:].max(-1) * (height_m - _RISE_M)
+        risen = rows.numpy()[:, None] < lowest
+        return _Upright(
+            inverse, risen, (y.numpy(), x.numpy()), inside.numpy(), (row.numpy(), column.numpy())
+        )
+
+    def seen(self, values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+        """A picture's values here; 0 outside of it."""
+        return np.where(self.inside, values[self.pixels], 0.0)
+
+    def shares(
+        self, gains: Float[np.ndarray, "H W"], edges: Float[np.ndarray, "H W"]
+    ) -> Float[Tensor, "H W"]:
+        """Of the picture's pixels, of what stands where it is likeliest, see `stixels`."""
+        nearest, floor = self.inverse.max(-1), self.inverse.argmax(-1) == 0
+        shares = np.ones_like(nearest)
+        for at, ends in enumerate(stixels(gains, edges, floor, self.risen)):
+            if ends is not None:
+                top, foot = ends
+                below = self.inverse[min(foot + 1, len(nearest) - 1), at, 0]
+                back = _LEADS_BACK * np.linspace(1, 0, foot - top + 1)
+                thing = below + (nearest[top, at] - below) * back
+                shares[top : foot + 1, at] = np.minimum(nearest[top : foot + 1, at] / thing, 1)
+        return torch.from_numpy(shares[self.places]).float()
 
 
 def _cells(
@@ -193,11 +191,3 @@ def _cells(
     cells = torch.linspace(least, most, count)
     step = max(most - least, 1e-9) / max(count - 1, 1)
     return cells, ((values - least) / step).round().long().clamp(0, count - 1)
-
-
-def _runs(there: Bool[np.ndarray, " N"]) -> Iterator[tuple[int, int]]:
-    """First and last row of each thing in a column."""
-    rows = there.nonzero()[0]
-    for run in np.split(rows, (np.diff(rows) > _GAP).nonzero()[0] + 1):
-        if len(run) and run[-1] - run[0] + 1 >= _LEAST_ROWS:
-            yield int(run[0]), int(run[-1])
