@@ -6,7 +6,7 @@ from typing import Any
 
 from evsplat.capture.distortion import are_coefficients
 from evsplat.capture.fields import Fields
-from evsplat.capture.finding import Findings
+from evsplat.capture.finding import Findings, refuse_errors
 from evsplat.capture.parse_cameras import intrinsics, rigid
 from evsplat.errors import DataError
 from evsplat.pictures.light import TRANSFERS
@@ -45,9 +45,7 @@ def read_camera(
     K = intrinsics(fields, width, height)
     if "world_to_camera" in entry:
         rigid(fields, "world_to_camera")
-    for finding in findings.items:
-        if finding.severity == "error":
-            raise DataError(f"{finding}")
+    refuse_errors(findings.items)
     return {
         "K": K,
         "world_to_camera": entry.get("world_to_camera"),

@@ -1,6 +1,5 @@
 """A capture made of another one: some pictures new, everything else as it was."""
 
-import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -15,11 +14,11 @@ from torch import Tensor
 
 from evsplat.capture.body_file import write_body
 from evsplat.capture.capture import Capture
+from evsplat.capture.finding import refuse_errors
 from evsplat.capture.metadata import Frame
 from evsplat.capture.policy import Policy
 from evsplat.capture.training_capture import TrainingCapture
 from evsplat.capture.validate import check_capture
-from evsplat.errors import DataError
 from evsplat.events import EventStream, write_events
 from evsplat.files import copy_file, make_folder, new_folder, remove_file, write_json
 from evsplat.pictures.files import holds_16_bits, write_image
@@ -149,10 +148,8 @@ def derived_capture(
         _undistort(making)
         yield making
         write_json(folder / "capture.json", document)
-        for finding in check_capture(folder, deep=False)[1]:
-            if finding.severity == "error":
-                place = path / finding.file.relative_to(folder)
-                raise DataError(f"{dataclasses.replace(finding, file=place)}")
+        _, findings = check_capture(folder, deep=False)
+        refuse_errors(findings, lambda file: path / file.relative_to(folder))
 
 
 def training_frames_first(

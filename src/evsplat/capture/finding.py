@@ -1,6 +1,7 @@
 """Faults that the validator found: the file, the field, what is there and what to do."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
@@ -50,6 +51,15 @@ class Findings:
     def error_count(self) -> int:
         """Count of the errors so far."""
         return sum(item.severity == "error" for item in self.items)
+
+
+def refuse_errors(
+    findings: Iterable[Finding], place: Callable[[Path], Path] = lambda file: file
+) -> None:
+    """Raise a `DataError` with the first error, if any; its file is at ``place(file)`` later."""
+    for finding in findings:
+        if finding.severity == "error":
+            raise DataError(f"{replace(finding, file=place(finding.file))}")
 
 
 def reason_and_remedy(error: DataError, file: Path) -> tuple[str, str]:

@@ -1,6 +1,5 @@
 """Writing a capture as a whole, piece by piece."""
 
-import dataclasses
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from evsplat.body.pose_errors import PoseSource
 from evsplat.calibration.gain import GainMeter
 from evsplat.calibration.moving_gain import MovingGainMeter
 from evsplat.capture.body_file import key_poses, save_arrays, write_body
+from evsplat.capture.finding import refuse_errors
 from evsplat.capture.parse import FORMAT, VERSION
 from evsplat.capture.parse_frames import default_split
 from evsplat.capture.points import write_points
@@ -398,10 +398,8 @@ class CaptureWriter:
             "provenance": self.provenance,
         }
         write_json(self._root / "capture.json", document)
-        for finding in check_capture(self._root, deep=False)[1]:
-            if finding.severity == "error":
-                place = self.path / finding.file.relative_to(self._root)
-                raise DataError(f"{dataclasses.replace(finding, file=place)}")
+        _, findings = check_capture(self._root, deep=False)
+        refuse_errors(findings, lambda file: self.path / file.relative_to(self._root))
         self._check_target()
 
 

@@ -130,9 +130,8 @@ def warn_of_capture(path: Path, body_models: Path | None = None) -> None:
     if metadata is None:
         return
     for finding in found:
-        if finding.field.startswith(
-            ("frames", "cameras")
-        ):  # notes of an import speak of events and body
+        # Notes of an import speak of events and body.
+        if finding.field.startswith(("frames", "cameras")):
             logger.warning("%s", finding)
     capture = Capture(metadata)
     seen = capture.for_training(Policy())

@@ -18,13 +18,11 @@ from evsplat.camera import Camera
 from evsplat.gaussians.initialise import pixel_rays
 from evsplat.methods.background import gone_on
 from evsplat.methods.colour_shares import ColourShares
-from evsplat.methods.line_directions import Lines, level_axes
-from evsplat.methods.plane_sweep import enlarged, pooled
-from evsplat.methods.room import Room, from_feet_m
+from evsplat.methods.line_directions import Lines, level_axes, step_to
+from evsplat.methods.plane_sweep import enlarged
+from evsplat.methods.room import REACH_M, SIDE_PX, Room, from_feet_m
 from evsplat.methods.stixels import stixels
 
-SIDE_PX = 128
-"""Shorter side, about, of the picture that is looked at."""
 _ROUNDS = 3
 _SURE, _PRICE, _ANYTHING = 3.0, 0.8, 0.1
 """Most that a pixel's colour says, as a logarithm of likelihoods, what furniture costs, and the
@@ -34,8 +32,6 @@ _EDGE, _USUAL = 8.0, 0.7
 less likely."""
 _RISE_M = 0.2
 """Least height at which a thing ends before the wall: skirting boards are lower."""
-_REACH_M = 0.7
-"""Way from the feet in which the floor's colours count 1 / e as much."""
 _FAR = 2.0
 """Weight of the floor far from the feet once things are known; what is near has 1 more."""
 _CLEARANCE, _BODY_PX = 1.03, 7
@@ -56,9 +52,9 @@ def furnished(
     Nothing stands before the ``body``, which the ``picture`` does not show: its points, metres,
     wherever it went.
     """
-    step = max(1, round(min(camera.width, camera.height) / SIDE_PX))
-    view = camera.smaller(step, whole=False)
-    lines = Lines.of(pooled(picture, step).double().numpy(), view)
+    step = step_to(camera, SIDE_PX)
+    lines = Lines.pooled(picture, camera, step)
+    view = lines.camera
     shares = _shares(lines, room)
     least = _CLEARANCE * _farthest_m(body, view) / room.depth(view)
     shares = torch.maximum(shares, least).clamp_max(1)
@@ -105,7 +101,7 @@ def _shares(lines: Lines, room: Room) -> Float[Tensor, "H W"]:
     view = lines.camera
     planes = room.inverse(view.center(), pixel_rays(view))
     floor = (planes.argmax(-1) == 0).numpy()
-    near = np.exp(-from_feet_m(view, planes[..., 0], room.feet, room.up) / _REACH_M)
+    near = np.exp(-from_feet_m(view, planes[..., 0], room.feet, room.up) / REACH_M)
     colours, upright = ColourShares(lines.picture), _Upright.of(view, room)
     edges = upright.seen(_EDGE * (lines.strength * (1 - lines.along(room.up)) - _USUAL))
     edges = np.maximum(edges, np.concatenate([edges[1:], edges[-1:]]))

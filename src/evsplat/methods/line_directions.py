@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 
 from evsplat.camera import Camera
 from evsplat.gaussians.initialise import pixel_rays
+from evsplat.methods.plane_sweep import pooled
 
 TURNS = np.radians(np.arange(-45.0, 45.0))
 """Of walls that are tried: at right angles to each other, they are the same a quarter turn on."""
@@ -54,6 +55,12 @@ class Lines:
         places = pixel_rays(camera) @ camera.world_to_camera[:2, :3].T
         return Lines(picture, camera, strength * inner, gradient, places.double().numpy())
 
+    @staticmethod
+    def pooled(picture: Float[Tensor, "H W 3"], camera: Camera, step: int) -> "Lines":
+        """By the means of squares of ``step`` pixels."""
+        means = pooled(picture, step).double().numpy()
+        return Lines.of(means, camera.smaller(step, whole=False))
+
     def along(self, direction: Float[Tensor, "3"]) -> Float[np.ndarray, "H W"]:
         """How well each edge's direction is that of the world, 1 where it is."""
         x, y, z = (self.camera.world_to_camera[:3, :3] @ direction).tolist()
@@ -63,6 +70,11 @@ class Lines:
         way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
         off = np.arcsin(np.clip(np.abs((way * self.gradient).sum(-1)), 0, 1))
         return np.exp(-0.5 * np.square(off / _OFF))
+
+
+def step_to(camera: Camera, side_px: int) -> int:
+    """Side of the squares of which a picture has about ``side_px`` along its shorter side."""
+    return max(1, round(min(camera.width, camera.height) / side_px))
 
 
 def level_axes(

@@ -20,8 +20,7 @@ from torch import Tensor
 from evsplat.camera import Camera
 from evsplat.gaussians.initialise import extremes, pixel_rays
 from evsplat.methods.colour_shares import ColourShares
-from evsplat.methods.line_directions import Lines, level_axes, wall_turn
-from evsplat.methods.plane_sweep import pooled
+from evsplat.methods.line_directions import Lines, level_axes, step_to, wall_turn
 
 SIDE_PX, FINE_PX = 128, 256
 """Shorter sides, about, of the picture that tells a room and of the one that tells its place."""
@@ -40,7 +39,7 @@ _FEET_M, _FEET = 0.25, 256
 """Height up to which a point of the body is of its feet, and how many of them count."""
 _SOLE_M = 0.02
 """By which a body, which is bare, stands above the floor."""
-_REACH_M = 0.7
+REACH_M = 0.7
 """Way from the feet in which the floor's colours count 1 / e as much."""
 _ANYTHING = 0.1
 """Share of a surface that may look like anything in the picture."""
@@ -123,7 +122,9 @@ def find_room(
     steep = abs(float(camera.world_to_camera[2, :3] @ up)) > _STEEPEST
     if steep or height_m < _LOWEST_M:
         return None
-    coarse, fine = (_lines(camera, picture, side_px) for side_px in (SIDE_PX, FINE_PX))
+    coarse, fine = (
+        Lines.pooled(picture, camera, step_to(camera, side_px)) for side_px in (SIDE_PX, FINE_PX)
+    )
     turn, agreement = wall_turn(coarse, up)
     if agreement < LEAST_AGREEMENT:
         return None
@@ -139,11 +140,6 @@ def find_room(
     offsets[1:] += normals[1:] @ center
     there = offsets.isfinite()
     return Room(normals[there], offsets[there], stage.feet)
-
-
-def _lines(camera: Camera, picture: Float[Tensor, "H W 3"], side_px: int) -> Lines:
-    step = max(1, round(min(camera.width, camera.height) / side_px))
-    return Lines.of(pooled(picture, step).double().numpy(), camera.smaller(step, whole=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +322,7 @@ def _floor_likelihood(
     """
     colours = ColourShares(picture)
     anything = colours.of(np.ones_like(inverse))
-    floor = colours.of(np.exp(-from_feet_m / _REACH_M))
+    floor = colours.of(np.exp(-from_feet_m / REACH_M))
     wall = colours.of(1.0 * (inverse < 0))
     mixed = ((1 - _ANYTHING) * share + _ANYTHING * anything for share in (floor, wall))
     ratio = np.subtract(*(np.log(each + 1e-12) for each in mixed))

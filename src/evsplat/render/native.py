@@ -112,7 +112,7 @@ class _Rasterize(torch.autograd.Function):
         # Gradients of pictures are read where they are: to put them into one of the image first
         # takes as long as many a loss.
         ctx.groups = job.groups or (channels.shape[2],)
-        ctx.mark_non_differentiable(*(image,) * bool(pictures), radii, static_radii)
+        ctx.mark_non_differentiable(radii, static_radii, *([image] if pictures else []))
         ctx.kept = kept
         ctx.save_for_backward(*inputs)
         return image, alpha, radii, static_radii, *pictures
