@@ -1,4 +1,4 @@
-"""Suites small enough for tests, and what their records say apart from times."""
+"""Suites small enough for tests, and what their records say apart from times and commits."""
 
 import importlib
 import json
@@ -31,13 +31,16 @@ def write_suite(path: Path, captures: dict[str, Path], *rows: dict, iterations: 
 
 
 def records(folder: Path) -> dict[str, dict]:
-    """Record of every cell without what depends on the clock."""
-    timed = {"seconds", "train_seconds", "train_cpu_seconds", "peak_memory_mb"}
+    """Record of every cell without what depends on the clock.
+
+    Without the commit either: the repository may be committed to, or changed, between two cells.
+    """
+    apart = {"seconds", "train_seconds", "train_cpu_seconds", "peak_memory_mb", "code"}
     found = {}
     for path in sorted((folder / "cells").rglob("*.json")):
         record = json.loads(path.read_text())
         found[path.relative_to(folder / "cells").as_posix()] = {
-            key: value for key, value in record.items() if key not in timed
+            key: value for key, value in record.items() if key not in apart
         }
     return found
 
