@@ -154,7 +154,10 @@ def stages(scene: Scene, repeats: int) -> tuple[dict[str, float], int]:
         job = native_job(scene)
         fields = (s.means, s.quaternions[None], s.scales[None], s.opacities[None], s.channels)
         grads = [*map(torch.zeros_like, fields), None, None]
-        job.backward(scene.image_grad, scene.alpha_grad, grads, [], torch.zeros(12), None, None)
+        job.backward(
+            list(scene.image_grad), (s.channels.shape[-1],), scene.alpha_grad, grads, [],
+            torch.zeros(12), None, None,
+        )  # fmt: skip
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
         for stage, seconds in job.seconds.items():
             best[stage] = min(best.get(stage, math.inf), 1e3 * seconds)

@@ -33,6 +33,7 @@ import h5py
 import numpy as np
 import torch
 from PIL import Image
+from rasterize import peak_flops
 from torch import Tensor
 
 from evsplat import _native
@@ -85,7 +86,7 @@ def main() -> None:
     steps = [_timed(trainer.step) for _ in range(arguments.steps)]
     median, best = 1e3 * statistics.median(steps), 1e3 * min(steps)
     renders, gflop = work(trainer, 3)
-    peak = _peak() * arguments.threads
+    peak = peak_flops() / 1e9 * arguments.threads
     limit = 1e3 * gflop / peak
     forward, backward, stages = measure(trainer, arguments.steps)
     counts = trainer.counts()
@@ -396,18 +397,6 @@ def _timed(call: Callable[[], object]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
-
-
-def _peak() -> float:
-    """GFLOP/s of independent multiply-adds on one core."""
-    _native.multiply_add(10_000_000)
-    return max(flops / seconds / 1e9 for flops, seconds in (_rate() for _ in range(5)))
-
-
-def _rate() -> tuple[float, float]:
-    start = time.perf_counter()
-    flops = _native.multiply_add(20_000_000)
-    return flops, time.perf_counter() - start
 
 
 if __name__ == "__main__":
