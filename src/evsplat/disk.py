@@ -74,14 +74,19 @@ def uninterrupted() -> Iterator[None]:
 def held(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold the lock of a file, which is made where it is missing and tells the process's number.
 
-    Where the file system has no locks nothing is held. The file stays.
+    So is its folder, which whoever held it may have removed. Where the file system has no locks
+    nothing is held. The file stays.
 
     Raises:
         BlockingIOError: Another process holds it; its number is the error's ``strerror``.
     """
     tries_left = _TRIES
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        except FileNotFoundError:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            continue
         try:
             if lock(handle, wait=wait) is False:
                 if not tries_left:

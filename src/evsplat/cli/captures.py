@@ -1,6 +1,7 @@
 """Verbs that make captures and event recordings, or look at them; ``import`` is in `import_`."""
 
 import os
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -198,8 +199,8 @@ class Inspect:
     def __call__(self) -> None:
         from evsplat.inspection import default_folder, inspect
 
-        out = self.out or default_folder(self.capture)
-        report = inspect(self.capture, out, repair=self.repair)
+        with nullcontext(self.out) if self.out else default_folder(self.capture) as out:
+            report = inspect(self.capture, out, repair=self.repair)
         if not report.usable:
             raise DataError(report.summary)
         print(report.summary)

@@ -39,6 +39,7 @@ from evsplat.inspection.event_check import (
     lie_elsewhere,
     warn_of_events,
 )
+from evsplat.inspection.folder import note_inspected
 from evsplat.inspection.picture_check import picture_findings, warn_of_pictures
 from evsplat.inspection.plots import draw_timeline
 from evsplat.inspection.sensor import clock_findings
@@ -74,8 +75,9 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     """Validate the capture fully and, where it has no errors, draw it into ``out_dir``.
 
     Writes contact_sheet.png, events.png, body.png, body_fit.png and timeline.png, as far as there
-    is something to draw. Where events lie beside the pixels of the pictures, what brings them there
-    is written to events_to_pictures.txt (`evsplat.events.moved`); else an earlier one is removed.
+    is something to draw, and inspected.json, what they show. Where events lie beside the pixels of
+    the pictures, what brings them there is written to events_to_pictures.txt
+    (`evsplat.events.moved`); else an earlier one is removed.
     """
     path, out_dir = Path(path), Path(out_dir)
     try_target(out_dir)
@@ -110,6 +112,7 @@ def inspect_capture(path: Path | str, out_dir: Path | str) -> InspectReport:
     if capture.events is not None and len(capture.events):
         drawings["events"] = _events_sheet(capture)
     drawings["timeline"] = draw_timeline(capture)
+    note_inspected(path, out_dir)
     if (beside := events.mendable) is not None:
         write_homography(homography, beside.homography, beside.size_px)
     pictures = save_drawings(drawings, out_dir)

@@ -44,17 +44,13 @@ _SHOWN_HOT_PIXELS = 6
 def inspect(path: Path | str, out_dir: Path | str, *, repair: bool = False) -> InspectReport:
     """Inspect a capture folder (`inspect_capture`) or an event recording (`inspect_recording`).
 
-    ``repair`` is of recordings alone. inspected.json beside the drawings says what they show.
+    ``repair`` is of recordings alone.
     """
     path = Path(path)
     # a ROS 2 bag is a folder with a metadata.yaml
     if path.is_file() or (path / "metadata.yaml").is_file():
-        report = inspect_recording(path, out_dir, repair=repair)
-    else:
-        report = inspect_capture(path, out_dir)
-    if report.pictures:
-        note_inspected(path, Path(out_dir))
-    return report
+        return inspect_recording(path, out_dir, repair=repair)
+    return inspect_capture(path, out_dir)
 
 
 def inspect_recording(
@@ -63,8 +59,8 @@ def inspect_recording(
     """Sum up an event recording of any format and draw it into ``out_dir``.
 
     Writes events.png and rate.png; where frames were recorded beside the events (AEDAT4) also
-    clock.png, how well both agree by the shift between their clocks. ``repair`` reads on where the
-    file is damaged.
+    clock.png, how well both agree by the shift between their clocks, and inspected.json, what they
+    show. ``repair`` reads on where the file is damaged.
 
     Raises:
         DataError: not a recording, or one without events.
@@ -104,6 +100,7 @@ def inspect_recording(
             marks=[clock.lag_us],
         )
     lines += [f"note       {note}" for note in recording.notes]
+    note_inspected(path, out_dir)
     pictures = save_drawings(drawings, out_dir)
     lines.append(f"pictures   {out_dir}: " + ", ".join(picture.name for picture in pictures))
     return InspectReport(path, (), "\n".join(lines), pictures)
