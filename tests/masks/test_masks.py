@@ -11,7 +11,7 @@ import torch
 
 from evsplat.body import silhouette
 from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
-from evsplat.errors import ConfigError, DataError
+from evsplat.errors import ConfigError, DataError, OutputError
 from evsplat.masks import MASKERS, mask_capture
 from evsplat.masks.background import clean, difference
 from evsplat.masks.silhouette import soft_silhouette
@@ -122,6 +122,21 @@ def test_in_place_adds_masks_and_never_replaces_others(tiny_capture: Factory) ->
     assert second.provenance["masks"]["margin_px"] == 2.0
     assert float(second.mask("0000").sum()) > float(first.mask("0000").sum())
     assert all(file.read_bytes() == content for file, content in before.items())
+
+
+def test_where_the_description_cannot_be_written_no_masks_are_left(
+    tiny_capture: Factory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, value: object) -> None:
+        raise OutputError(f"{path}: no room.")
+
+    path = _without_masks(tiny_capture())
+    before = sorted(path.rglob("*"))
+    with monkeypatch.context() as patch:
+        patch.setattr("evsplat.masks.capture.write_json", full)
+        with pytest.raises(OutputError, match=r"capture\.json: no room"):
+            mask_capture(path, method="silhouette")
+    assert sorted(path.rglob("*")) == before
 
 
 def test_stopping_midway_changes_nothing(

@@ -1,6 +1,7 @@
 """`evsplat masks`: person masks for a capture, in a new one or in itself."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ import evsplat
 from evsplat.capture import Capture, Frame, Policy, load_capture
 from evsplat.capture.derive import derived_capture, training_frames_first, write_picture
 from evsplat.config import to_dict
-from evsplat.errors import ConfigError, DataError
-from evsplat.files import new_folder, refuse_existing, try_target, write_json
+from evsplat.errors import ConfigError, DataError, OutputError
+from evsplat.files import new_folder, refuse_existing, remove_folder, try_target, write_json
 from evsplat.masks.base import MASKERS, Masker
 from evsplat.untrusted.text import read_json
 
@@ -94,7 +95,12 @@ def _write_in_place(
             write_picture(temporary / name, mask)
             entries[frame.name]["mask"] = f"{folder.name}/{name}"
     document["provenance"] = {**capture.provenance, "masks": made}
-    write_json(capture.path / "capture.json", document)
+    try:
+        write_json(capture.path / "capture.json", document)
+    except OutputError:
+        with suppress(OutputError):
+            remove_folder(folder)  # which nothing names
+        raise
 
 
 def _free_name(parent: Path, stem: str) -> Path:
