@@ -47,10 +47,12 @@ EXPECTED = {
 }
 """Exit codes of what was interrupted; 0 where it came too late."""
 IMPORTED = (
-    "benching.run events.convert export importers masks.capture posing restore.capture staging "
-    "training"
+    "benching.run evaluation.run events.convert export footage.simulate importers inspection "
+    "masks.capture posing restore.capture staging synthesis training"
 ).split()
-LEFT = re.compile(r"\.evsplat-|(^|/)\.?tmp|\.watch$|snapshot\.safetensors$|\.part$|\.partial$")
+LEFT = re.compile(
+    r"\.evsplat-|(^|/)\.?tmp|\.(watch|evaluating|inspecting|part|partial)$|snapshot\.safetensors$"
+)
 NOT_FOUND_OUT = re.compile(r"Traceback \(most recent|Exception ignored|Segmentation|core dumped")
 
 
@@ -76,6 +78,19 @@ def save_after_every_step() -> None:
     loop.CHECKPOINT_SECONDS = 0.0
 
 
+def copied(source: Path) -> Callable[[], None]:
+    """What a command changes in place is there, if it is the first to run."""
+
+    def copy() -> None:
+        target = Path(source.name)
+        if source.is_dir() and not target.exists():
+            shutil.copytree(source, target)
+        elif not target.exists():
+            shutil.copyfile(source, target)
+
+    return copy
+
+
 def jobs(given: Path) -> dict[str, Job]:
     """Commands by name; ``given`` holds what they read."""
     capture, run_folder = str(given / "capture"), str(given / "run")
@@ -86,21 +101,38 @@ def jobs(given: Path) -> dict[str, Job]:
     export = ("export", run_folder)
     still = ("--frame", "0003", "--device", "cpu")
     render = ("render", run_folder, "--device", "cpu", "--out")
+    film = (*render, "made/a.mp4", "--show", "events", "--events", "made/a.h5")
     bench = ("bench", str(given / "suite.yaml"), "--out", "made", "--device", "cpu")
+    pictures = (str(given / "capture" / "images"), "--source-fps", "200", "--out")
+    synthesize = ("synthesize", *pictures, "made", "--fps", "50", "--upsample", "2")
+
+    def in_place(*words: str, source: Path) -> Job:
+        return Job(words, source.name, words, prepare=copied(source))
+
     return {
         "train": Job(start, "run", on, "config.yaml", save_after_every_step),
         "train-seldom": Job(start, "run", on, "config.yaml"),
+        "evaluate": in_place("evaluate", "run", "--device", "cpu", source=given / "run"),
+        "report": in_place("report", "evaluated", source=given / "evaluated"),
+        "inspect": Job(("inspect", capture), "inspect/capture", ("inspect", capture)),
+        "simulate": Job(("simulate", *pictures, "made.h5"), "made.h5"),
+        "synthesize": Job(synthesize, "made"),
         "import": Job(("import", "neuman", str(given / "neuman"), "--out", "made"), "made"),
         "stage": Job(("stage", "made", "--size", "48", "--frames", "3", "--threads", "1"), "made"),
         "convert-h5": Job(("convert", str(given / "long.csv"), "made.h5"), "made.h5"),
         "convert-npz": Job(("convert", str(given / "long.csv"), "made.npz"), "made.npz"),
         "convert-csv": Job(("convert", str(given / "long.h5"), "made.csv"), "made.csv"),
+        "convert-in-place": in_place(
+            "convert", "long.csv", "--in-place", "--from-zero", source=given / "long.csv"
+        ),
         "convert-raw": Job(("convert", str(given / "long.h5"), "made.raw"), "made.raw"),
         "export-ply": Job((*export, "ply", *still, "--out", "made.ply"), "made.ply"),
         "export-gltf": Job((*export, "gltf", *still, "--out", "made.glb"), "made.glb"),
+        "export-html": Job((*export, "html", "--device", "cpu", "--out", "made.html"), "made.html"),
         "export-avatar": Job((*export, "avatar", "--device", "cpu", "--out", "made"), "made"),
         "render-video": Job((*render, "made.mp4"), "made.mp4", keeps=r"made\.mp4\.partial$"),
         "render-pictures": Job((*render, "made"), "made", keeps=r"made\.partial$"),
+        "render-events": Job(film, "made", film, keeps=r"made/a\.mp4\.partial$"),
         "masks": Job(("masks", capture, "--out", "made", "--with", "silhouette"), "made"),
         "restore": Job(("restore", capture, "--out", "made", "--with", "edi"), "made"),
         "poses": Job(
@@ -203,6 +235,9 @@ def make_inputs(given: Path, place: Path) -> None:
     ended = run(list(jobs(given)["train"].command), disk)
     assert ended.code == 0, ended.said
     shutil.copytree(disk.path / "run", given / "run")
+    ended = run(["evaluate", "run", "--device", "cpu"], disk)
+    assert ended.code == 0, ended.said
+    shutil.copytree(disk.path / "run", given / "evaluated")
     disk.close()
 
 
@@ -298,7 +333,7 @@ def made(out: Path) -> dict[str, str]:
             del found[name]
         elif path.suffix == ".safetensors":
             found[name] = tensors(path)
-        elif path.name == "log.jsonl" or (path.suffix == ".json" and "cells/" in name):
+        elif re.search(r"(^|/)(log\.jsonl|metrics\.json|cells/.*\.json)$", name):
             lines = [untimed(json.loads(line)) for line in _documents(path)]
             found[name] = hashlib.sha256(json.dumps(lines).encode()).hexdigest()
     steps = sorted(name for name in found if name.endswith(".safetensors"))
@@ -314,7 +349,7 @@ def _documents(path: Path) -> list[str]:
 
 def untimed(record: dict[str, object]) -> dict[str, object]:
     """A record without what depends on the clock."""
-    timed = {"seconds", "train_seconds", "train_cpu_seconds", "peak_memory_mb"}
+    timed = {"seconds", "train_seconds", "train_cpu_seconds", "evaluate_seconds", "peak_memory_mb"}
     return {key: value for key, value in record.items() if key not in timed}
 
 
