@@ -117,6 +117,7 @@ def test_the_davis_recording_is_read_with_its_frames(recordings_root: Path, tmp_
         "78,830 over 2.360 s",
         "59: 346x260, 25 frames/s, exposure 0.5 ms",
         "events lag the frames by 5.",
+        "ms from part to part, and up to 5.5 too late if all that moves is slow; correlation 0.9",
         "would align them",
     ):
         assert words in report.summary

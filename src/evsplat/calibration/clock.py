@@ -16,6 +16,10 @@ LEAST_PIXELS = 300
 LEAST_CORRELATION = 0.3
 MOST_LAG_US = 4_000
 """Events are late by a few ms by their nature; clocks that differ by more are reported."""
+SLOW_MOTION_US = 5_500
+"""Where all that moves is slow events are later than their clock by so much at most, as pixels wait
+for a threshold: measured (docs/clock-and-thresholds.md), and in no standard error, since all parts
+of a recording are late together."""
 _GROUPS = 8
 _FEWEST_MOVING = 4
 """Pairs of frames, counted by what each tells, below which they say nothing of an error: a step
@@ -29,8 +33,8 @@ class ClockEstimate:
     lag_us: float
     """Events are stamped this much later than the frames: subtract it from their times."""
     spread_us: float
-    """Standard error of ``lag_us`` over the recording (jackknife over groups of frames); NaN where
-    something moves in too few frames to tell it."""
+    """Standard error of ``lag_us`` over the recording (jackknife over groups of frames), without
+    what `SLOW_MOTION_US` says; NaN where something moves in too few frames to tell it."""
     correlation: float
     """Pearson's, of log luminance change and signed event count at ``lag_us``."""
     lags_us: Float[np.ndarray, "L"]

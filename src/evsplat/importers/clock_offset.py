@@ -6,7 +6,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from evsplat.calibration.clock import SEARCH_US
+from evsplat.calibration.clock import SEARCH_US, SLOW_MOTION_US
 from evsplat.calibration.offset import (
     LEAST_CORRELATION,
     BlockChanges,
@@ -114,8 +114,9 @@ def found_offset(
             f"({found.rival:.2f}); {give}."
         )
     note = (
-        f"events: the offset of their clock is found, {offset_us} us (correlation "
-        f"{found.correlation:.2f}, elsewhere {found.rival:.2f} at most)"
+        f"events: the offset of their clock is found, {offset_us} us, to about "
+        f"{SLOW_MOTION_US / 1000:g} ms (correlation {found.correlation:.2f}, elsewhere "
+        f"{found.rival:.2f} at most)"
     )
     return offset_us, note
 

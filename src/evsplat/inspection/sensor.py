@@ -3,6 +3,7 @@
 import math
 
 from evsplat.calibration import ClockEstimate, SensorEstimate
+from evsplat.calibration.clock import SLOW_MOTION_US
 from evsplat.capture.capture import Capture
 from evsplat.capture.finding import Finding, Findings
 
@@ -20,7 +21,10 @@ def sensor_lines(
         ]
     clock, contrast = estimate.clock, estimate.thresholds
     unknown = math.isnan(clock.spread_us)
-    doubt = "too little moves to tell an error" if unknown else f"+-{clock.spread_us / 1000:.1f} ms"
+    doubt = "too little moves to tell an error"
+    if not unknown:
+        doubt = f"+-{clock.spread_us / 1000:.1f} ms from part to part, and up to "
+        doubt += f"{SLOW_MOTION_US / 1000:g} too late if all that moves is slow"
     text = f"clock      events {_lag_text(clock)} ({doubt}; correlation {clock.correlation:.2f})"
     if clock.differs:
         text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"
