@@ -348,9 +348,10 @@ def _documents(path: Path) -> list[str]:
 
 
 def untimed(record: dict[str, object]) -> dict[str, object]:
-    """A record without what depends on the clock."""
-    timed = {"seconds", "train_seconds", "train_cpu_seconds", "evaluate_seconds", "peak_memory_mb"}
-    return {key: value for key, value in record.items() if key not in timed}
+    """A record without what depends on the clock, or on who commits to the repository meanwhile."""
+    timed = {"seconds", "train_seconds", "train_cpu_seconds", "evaluate_seconds"}
+    apart = timed | {"peak_memory_mb", "code"}
+    return {key: value for key, value in record.items() if key not in apart}
 
 
 def tensors(path: Path) -> str:
