@@ -274,6 +274,17 @@ def test_ctrl_c_is_answered_with_a_word(capsys, monkeypatch, tmp_path):
     assert (code, stderr) == (130, "\nevsplat: Stopped.\n")
 
 
+@pytest.mark.parametrize("reading", ["import_with_kinds", "_gathered"])
+def test_ctrl_c_while_the_command_line_is_read_is_answered_too(capsys, monkeypatch, reading):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    # The package has a function of the module's name.
+    monkeypatch.setattr(sys.modules["evsplat.cli.main"], reading, interrupted)
+    code, _, stderr = _outcome(capsys, "import", "neuman", "there", "--out", "made")
+    assert (code, stderr) == (130, "\nevsplat: Stopped.\n")
+
+
 def test_view_without_its_package_says_how_to_get_it(capsys, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "viser", None)
     (tmp_path / "config.yaml").touch()

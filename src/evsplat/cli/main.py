@@ -62,14 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if is_process and not sys.stderr.isatty():
         # In a file each move of a progress bar is a line; tqdm, not imported yet, reads this.
         os.environ.setdefault("TQDM_MININTERVAL", "30")
-    arguments = _gathered(sys.argv[1:] if arguments is None else arguments)
-    verbs = _VERBS
-    if not arguments or arguments[0].startswith("-"):
-        verbs = {name: _in_a_line(verb) for name, verb in _VERBS.items()}
-    if arguments[:1] == ["import"]:
-        verbs = {**_VERBS, "import": import_with_kinds()}
+    typed = sys.argv[1:] if arguments is None else arguments
 
     def work() -> None:
+        arguments = _gathered(typed)
         if arguments == ["--version"]:
             print(f"evsplat {evsplat.__version__}")
             return
@@ -80,6 +76,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
         if arguments[:1] == ["import"]:
             check_kind(arguments[1:])
+        verbs = _VERBS
+        if not arguments or arguments[0].startswith("-"):
+            verbs = {name: _in_a_line(verb) for name, verb in _VERBS.items()}
+        if arguments[:1] == ["import"]:
+            verbs = {**_VERBS, "import": import_with_kinds()}
         with IN_ORDER:
             asked = tyro.extras.subcommand_cli_from_dict(
                 verbs,
