@@ -51,7 +51,7 @@ IMPORTED = (
     "masks.capture posing restore.capture staging synthesis training"
 ).split()
 LEFT = re.compile(
-    r"\.evsplat-|(^|/)\.?tmp|\.(watch|evaluating|inspecting|part|partial)$|snapshot\.safetensors$"
+    r"\.evsplat-|(^|/)\.?tmp|\.(watch|evaluating|filming|inspecting|part|partial)$|snapshot\.safetensors$"
 )
 NOT_FOUND_OUT = re.compile(r"Traceback \(most recent|Exception ignored|Segmentation|core dumped")
 

@@ -1,6 +1,7 @@
 """Films from start to end: options that contradict, stopping and going on, light and events."""
 
 import json
+import os
 import signal
 import threading
 import time
@@ -182,6 +183,7 @@ def test_a_held_moment_is_one_time_from_many_places(lamp, tmp_path):
         ({"transparent": True, "beside": True}, "--beside"),
         ({"show": "depth", "transparent": True}, "--transparent"),
         ({"motion": "walk", "beside": True}, "--beside"),
+        ({"show": "events", "at": 0.1, "beside": True}, "--beside: no events were recorded"),
         ({"show": "depth", "beside": True, "out": "folder"}, "--beside: a folder holds depth"),
         ({"motion_fps": 20.0}, "--motion-fps: goes with --motion"),
         ({"in_place": True}, "--in-place: goes with --motion"),
@@ -233,6 +235,21 @@ def test_a_folder_in_the_way_of_kept_pictures_is_left_alone(lamp, tmp_path):
     with pytest.raises(DataError, match=r"film\.mp4\.partial: is in the way"):
         render_run(lamp.run, out=tmp_path / "film.mp4")
     assert (mine / "notes.txt").read_text() == "keep"
+
+
+def test_a_film_that_another_process_makes_is_refused_and_left_alone(lamp, tmp_path):
+    out = tmp_path / "film.mp4"
+    with FrameCache.held(tmp_path / "film.mp4.partial", "of the other") as other:
+        before = sorted(other.path.iterdir())
+        for fps in (25.0, 50.0):
+            busy = rf"film\.mp4\.partial: process {os.getpid()} makes this film; wait for its end"
+            with pytest.raises(ConfigError, match=busy):
+                render_run(lamp.run, fps=fps, out=out)
+        assert sorted(other.path.iterdir()) == before
+    assert not out.exists()
+    (other.path / ".filming").touch()  # of one that was killed
+    assert render_run(lamp.run, fps=25, out=out).is_file()
+    assert not other.path.exists()
 
 
 @pytest.mark.parametrize("text", ["{", "[" * 100_000], ids=["broken", "deep"])

@@ -69,7 +69,7 @@ def render_run(
     that draw; None takes all cores.
 
     Pictures are kept beside the result in ``NAME.partial`` until it is complete: when stopped, the
-    same call goes on from there.
+    same call goes on from there. While another process makes it there is a `ConfigError`.
     """
     film = given(Film, film, changes)
     ours_at = folder_of(run) / "renders"
@@ -92,10 +92,10 @@ def render_run(
     look = Look(film.show, film.parts, film.transparent, transfer, plan.surroundings)
     trained = loaded.method, loaded.iteration, loaded.train_seconds
     digest = film_digest(plan.frames, look, film, *trained, *plan.from_files)
-    cache = FrameCache(out.with_name(out.name + ".partial"), digest)
-    cache.fill(plan.reconstruction, look, plan.frames)
-    _write(film, plan, cache, out, events_out, anew=ours)
-    cache.remove()
+    with FrameCache.held(out.with_name(out.name + ".partial"), digest) as cache:
+        cache.fill(plan.reconstruction, look, plan.frames)
+        _write(film, plan, cache, out, events_out, anew=ours)
+        cache.remove()
     return out
 
 

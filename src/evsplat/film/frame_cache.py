@@ -2,7 +2,8 @@
 
 import hashlib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby, islice
 from pathlib import Path
@@ -14,7 +15,7 @@ from tqdm import tqdm
 
 from evsplat.camera import Camera
 from evsplat.errors import DataError
-from evsplat.files import atomic_path, remove_folder, write_json
+from evsplat.files import atomic_path, held_folder, remove_file, remove_folder, write_json
 from evsplat.film.looks import Exposure, Look
 from evsplat.meanwhile import meanwhile
 from evsplat.names import checked_name
@@ -28,6 +29,8 @@ _TIMES_AT_ONCE = 8
 _KEPT_BYTES = 64 << 20
 """Of a film's first frames, which are not read back from the disk."""
 _PLAN = "plan.json"
+_SIGN = ".filming"
+"""File in the folder that is there while a film is made of it, and whose lock is held then."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,16 +55,33 @@ class FrameCache:
     """
 
     def __init__(self, path: Path, digest: str) -> None:
+        """Only for who holds the folder: see `held`."""
         self.path = path
         self._drawn: dict[Path, Exposure] = {}
         self._left_bytes = _KEPT_BYTES
         plan = path / _PLAN
-        if path.exists() and not plan.is_file() and (path.is_file() or any(path.iterdir())):
-            raise DataError(f"{path}: is in the way of pictures to be kept; move it elsewhere.")
         if plan.is_file() and read_json(plan) != {"plan": digest}:
             logger.info("%s: kept pictures belong to other options; starting over.", path)
-            remove_folder(path)
+            for file in path.iterdir():
+                if file.name not in (_PLAN, _SIGN):
+                    remove_file(file)
         write_json(plan, {"plan": digest})
+
+    @classmethod
+    @contextmanager
+    def held(cls, path: Path, digest: str) -> "Iterator[FrameCache]":
+        """The cache at ``path`` to the end of the block.
+
+        Raises:
+            ConfigError: Another process makes a film of it.
+            DataError: Something else is there.
+        """
+        plan = path / _PLAN
+        if path.is_file() or (path.is_dir() and not plan.is_file() and _holds_others(path)):
+            raise DataError(f"{path}: is in the way of pictures to be kept; move it elsewhere.")
+        busy = "makes this film; wait for its end or give another name to --out."
+        with held_folder(path, _SIGN, busy):
+            yield cls(path, digest)
 
     def __len__(self) -> int:
         """Number of frames drawn so far."""
@@ -140,6 +160,11 @@ def film_digest(frames: Iterable[FilmFrame], *rest: object) -> str:
     for value in rest:
         digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return digest.hexdigest()
+
+
+def _holds_others(folder: Path) -> bool:
+    """Whether there is more in a folder than the sign of who has just begun, or was killed."""
+    return any(file.name != _SIGN for file in folder.iterdir())
 
 
 def _of_one_camera(frames: Sequence[FilmFrame]) -> Iterable[list[FilmFrame]]:

@@ -151,6 +151,8 @@ class Film:
         if self.beside and (self.motion is not None or self.transparent):
             other = "motion" if self.motion is not None else "transparent"
             raise ConfigError(f"--beside: the input does not fit --{other}; leave one out.")
+        if self.beside and self.at is not None and self.show == "events":
+            raise ConfigError("--beside: no events were recorded while --at holds; leave one out.")
         if self.motion is None and (self.motion_fps is not None or self.in_place):
             option = "in-place" if self.in_place else "motion-fps"
             raise ConfigError(f"--{option}: goes with --motion; name one or leave it out.")
