@@ -198,6 +198,7 @@ def test_a_held_moment_is_one_time_from_many_places(lamp, tmp_path):
         ({"what": "test", "show": "events"}, "--show events: films the sequence"),
         ({"path": "nowhere.json"}, "--path nowhere.json"),
         ({"events_out": "e.h5"}, "--events: goes with --show events"),
+        ({"events_out": "e.foo", "show": "events"}, "e.foo: the suffix names no format"),
         ({"fps": 60.0, "out": "a.gif"}, "a GIF plays"),
         ({"seconds": 0.0}, "--seconds 0"),
     ],
@@ -235,6 +236,13 @@ def test_a_folder_in_the_way_of_kept_pictures_is_left_alone(lamp, tmp_path):
     with pytest.raises(DataError, match=r"film\.mp4\.partial: is in the way"):
         render_run(lamp.run, out=tmp_path / "film.mp4")
     assert (mine / "notes.txt").read_text() == "keep"
+
+
+def test_a_folder_where_events_shall_be_is_refused_before_anything_is_drawn(lamp, tmp_path):
+    (tmp_path / "e.h5").mkdir()
+    with pytest.raises(DataError, match=r"e\.h5: is a folder; give the name of a file"):
+        render_run(lamp.run, show="events", events_out=tmp_path / "e.h5", out=tmp_path / "film")
+    assert not lamp.lamp.drawn
 
 
 def test_a_film_that_another_process_makes_is_refused_and_left_alone(lamp, tmp_path):

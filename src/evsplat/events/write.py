@@ -67,7 +67,7 @@ def write_events(
         ConfigError: No such format.
     """
     path = Path(path)
-    format = _format_of(path, format)
+    format = written_format(path, format)
     try_target(path)
     size = None if width is None or height is None else (width, height)
     stored = {**(attributes or {}), **dict(zip(("width", "height"), size or (), strict=False))}
@@ -94,18 +94,25 @@ def write_events(
     return count
 
 
-def _format_of(path: Path, asked: str | None) -> str:
-    """The format asked for, or that of the suffix; refused where ``path`` cannot be one."""
+def written_format(path: Path, asked: str | None = None) -> str:
+    """The format of `write_events` that is asked for, or else that of the suffix.
+
+    Raises:
+        ConfigError: No such format.
+        DataError: ``path`` is a device, and the format cannot be written to one, or a folder.
+    """
     if asked is None and path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(
-            f"{path}: the suffix names no format that evsplat writes ({', '.join(_SUFFIXES)}); "
-            f"choose one with format: {', '.join(WRITTEN_FORMATS)}."
+            f"{path}: the suffix names no format that evsplat writes events in; give a name that "
+            f"ends in {', '.join(_SUFFIXES)}."
         )
     chosen = asked or _SUFFIXES[path.suffix.lower()]
     if chosen not in WRITTEN_FORMATS:
         raise ConfigError(f"format is {chosen!r}, expected one of {', '.join(WRITTEN_FORMATS)}.")
     if chosen == "hdf5" and path.exists() and not path.is_file() and not path.is_dir():
         raise DataError(f"{path}: is a device, which HDF5 cannot be written to; write csv or evt2.")
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder; give the name of a file.")
     return chosen
 
 

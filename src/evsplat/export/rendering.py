@@ -20,6 +20,7 @@ from evsplat.events import (
     simulate_events,
     write_events,
 )
+from evsplat.events.write import written_format
 from evsplat.files import try_target
 from evsplat.film.camera_path import check_camera
 from evsplat.film.frame_cache import FilmFrame, FrameCache, film_digest
@@ -121,6 +122,8 @@ def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours:
         )
     if events_out is not None and film.show != "events":
         raise ConfigError("--events: goes with --show events, which simulates them.")
+    if events_out is not None:
+        written_format(Path(events_out))
     if suffix == ".gif" and film.fps > 50:
         raise ConfigError(f"--fps {film.fps:g}: a GIF plays at most 50 pictures a second.")
     if suffix not in (*_VIDEO, *_ANIMATION):
