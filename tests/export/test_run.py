@@ -145,3 +145,17 @@ def test_bad_options_are_one_sentence_and_write_nothing(run, kind, options, mess
     with pytest.raises((ConfigError, DataError), match=message):
         export_run(run.path, kind, **options)
     assert not list(run.path.iterdir())
+
+
+@pytest.mark.parametrize("out", [None, "mine"])
+def test_an_avatar_that_is_there_is_told_before_the_work(run, monkeypatch, tmp_path, out):
+    def worked(*arguments, **options):
+        raise AssertionError("the run was read")
+
+    monkeypatch.setattr("evsplat.export.run.opened", worked)
+    folder = run.path / "exports" / "avatar" if out is None else tmp_path / out
+    folder.mkdir(parents=True)
+    (folder / "index.html").touch()
+    with pytest.raises(DataError, match="already"):
+        export_run(run.path, "avatar", out=None if out is None else folder)
+    assert [path.name for path in folder.iterdir()] == ["index.html"]

@@ -20,7 +20,7 @@ from evsplat.export.gaussians import (
 )
 from evsplat.export.low_pass import for_viewer
 from evsplat.export.skeleton import export_motion
-from evsplat.files import try_target
+from evsplat.files import refuse_existing, try_target
 from evsplat.options import ExportOptions
 from evsplat.options.declare import given
 from evsplat.options.runs import FileKind, Kind
@@ -78,10 +78,12 @@ def export_run(
     target = _checked(options.out, kind)
     folder = folder_of(run) / "exports"
     try_target(target or folder)
+    avatar = target or folder / "avatar"
+    if kind == "avatar" and not avatar.suffix:
+        refuse_existing(avatar)  # before minutes of work, whose folder is a new one
     loaded = opened(run, device=options.device)
     if kind == "avatar":
-        page = target or folder / "avatar"
-        return export_avatar(loaded, page, parts or "human", camera, options)
+        return export_avatar(loaded, avatar, parts or "human", camera, options)
     if kind == "bvh" or kind == "skeleton":
         name = "recorded" if options.motion is None else Path(options.motion).stem
         file = target or folder / f"{name}{_SUFFIXES[kind][0]}"
