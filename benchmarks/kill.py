@@ -53,6 +53,8 @@ IMPORTED = (
 LEFT = re.compile(
     r"\.evsplat-|(^|/)\.?tmp|\.(watch|evaluating|filming|inspecting|part|partial)$|snapshot\.safetensors$"
 )
+EVALUATION = rb"evaluation</[^>]*>\s*<[^>]*>[^<]*"
+"""What a report tells of the time that it took."""
 NOT_FOUND_OUT = re.compile(r"Traceback \(most recent|Exception ignored|Segmentation|core dumped")
 
 
@@ -336,6 +338,9 @@ def made(out: Path) -> dict[str, str]:
         elif re.search(r"(^|/)(log\.jsonl|metrics\.json|cells/.*\.json)$", name):
             lines = [untimed(json.loads(line)) for line in _documents(path)]
             found[name] = hashlib.sha256(json.dumps(lines).encode()).hexdigest()
+        elif path.name == "report.html":
+            page = re.sub(EVALUATION, b"", path.read_bytes())
+            found[name] = hashlib.sha256(page).hexdigest()
     steps = sorted(name for name in found if name.endswith(".safetensors"))
     for name in steps[:-1]:
         del found[name]  # which ones are kept depends on when they were saved
