@@ -3,6 +3,7 @@
 #include <memory>
 
 #include "bindings.h"
+#include "kept_memory.h"
 #include "levels.h"
 #include "mlp.h"
 #include "picture.h"
@@ -498,6 +499,8 @@ NB_MODULE(_native, m) {
     m.def("lanes", [] { return select_kernels().lanes; }, "Pixels per patch of the SIMD level in use.");
     m.def("levels", &available_levels, "SIMD levels that run here, best first.");
     m.def("level", [] { return std::string(select_kernels().name); }, "SIMD level in use.");
+    m.def("keep_freed_memory", &keep_freed_memory,
+          "Let the C library keep what is freed for what asks next, in huge pages; false where it is not glibc.");
     m.def("multiply_add", &multiply_add, nb::arg("rounds"),
           "Run independent multiply-adds; returns the floating-point operations done.");
     bind_zbuffer(m);

@@ -1,7 +1,12 @@
-"""A compiled module that is older than the sources which call it."""
+"""A compiled module that is older than its sources' calls; what it asks of the C library."""
 
+import ctypes
+import multiprocessing
 import os
+import platform
 import re
+import resource
+from concurrent.futures import ProcessPoolExecutor
 from operator import methodcaller
 from pathlib import Path
 
@@ -89,3 +94,32 @@ def test_faults_of_the_sources_stay_what_they_are(checkout: Path, error):
     called = {TypeError: native.window_means, AttributeError: methodcaller("missing")}
     with pytest.raises(error):
         exit_code(lambda: called[error](1))
+
+
+def _faults_of_steps(keeping: bool) -> int:
+    """Pages that the system hands over in four steps of four arrays of 28 MB."""
+    if keeping:
+        compiled.keep_freed_memory()
+        compiled.keep_freed_memory()  # asked for again, it does nothing
+    # Without tensors, whose small parts may come to lie at the end of the heap and hold it there.
+    library = ctypes.CDLL(None)
+    library.malloc.restype, library.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+    for _ in range(2):  # the second time, without what the first steps of all need
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(4):
+            arrays = [library.malloc(28 << 20) for _ in range(4)]
+            for array in arrays:
+                ctypes.memset(array, 1, 28 << 20)
+            for array in arrays:
+                library.free(array)
+        faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    return faults
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator is what is told")
+def test_freed_memory_is_kept_for_the_next_step():
+    context = multiprocessing.get_context("spawn")  # the setting holds for a whole process
+    with ProcessPoolExecutor(1, context) as plain, ProcessPoolExecutor(1, context) as keeping:
+        given_back = plain.submit(_faults_of_steps, False).result()
+        kept = keeping.submit(_faults_of_steps, True).result()
+    assert kept < given_back / 100, (kept, given_back)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from evsplat.capture import Camera, Frame, TrainingCapture
+from evsplat.compiled import keep_freed_memory
 from evsplat.devices import DeviceCache, default_cache_bytes, send
 from evsplat.gaussians import GaussianSet, Part, Rows, ScreenStatistics, densify, flip_labels
 from evsplat.gaussians.depth_order import depths_kept
@@ -95,6 +96,7 @@ class Trainer:
 
         ``cache_bytes`` bounds the recorded data kept on a GPU; None: a quarter of what is free.
         """
+        keep_freed_memory()
         self.composition, self.capture, self.clock = composition, capture, clock
         self.model = composition.model
         self.device = self.model.device
