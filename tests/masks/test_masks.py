@@ -11,6 +11,7 @@ import torch
 
 from evsplat.body import silhouette
 from evsplat.capture import Capture, load_body_track, load_capture, validate_capture
+from evsplat.capture.derive import write_picture
 from evsplat.errors import ConfigError, DataError, OutputError
 from evsplat.masks import MASKERS, mask_capture
 from evsplat.masks.background import clean, difference
@@ -136,6 +137,26 @@ def test_where_the_description_cannot_be_written_no_masks_are_left(
         patch.setattr("evsplat.masks.capture.write_json", full)
         with pytest.raises(OutputError, match=r"capture\.json: no room"):
             mask_capture(path, method="silhouette")
+    assert sorted(path.rglob("*")) == before
+
+
+def test_a_description_that_was_changed_meanwhile_stays(
+    tiny_capture: Factory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _without_masks(tiny_capture())
+    description = path / "capture.json"
+    changed = json.loads(description.read_text()) | {"provenance": {"by": "somebody else"}}
+    write = write_picture
+
+    def written(*arguments: object) -> None:
+        description.write_text(json.dumps(changed))
+        write(*arguments)
+
+    before = sorted(path.rglob("*"))
+    monkeypatch.setattr("evsplat.masks.capture.write_picture", written)
+    with pytest.raises(DataError, match=r"capture\.json: was changed while masks were made"):
+        mask_capture(path, method="silhouette")
+    assert json.loads(description.read_text()) == changed
     assert sorted(path.rglob("*")) == before
 
 

@@ -120,11 +120,10 @@ def _times(
         mids = [frame.mid_us for frame in recorded_by(capture, film.camera)]
         first, last = mids[0], mids[-1]
     if film.at is not None:
-        held = round(film.at * 1e6)
+        held = first + round(film.at * 1e6)
         if not first <= held <= last:
             raise ConfigError(
-                f"--at {film.at:g}: expected {first / 1e6:g} to {last / 1e6:g} s, where the "
-                "person's pose is known."
+                f"--at {film.at:g}: expected 0 to {(last - first) / 1e6:g} s from the beginning."
             )
         length = round((film.seconds or _HELD_SECONDS) * 1e6)
         clock = _even_steps(length, film.fps * oversampling)

@@ -87,16 +87,21 @@ def _write_in_place(
     made: dict[str, Any],
 ) -> None:
     folder = _free_name(capture.path, f"masks-{masker.name}")
-    document = read_json(capture.path / "capture.json")
-    entries = {entry["name"]: entry for entry in document["frames"]}
+    description = capture.path / "capture.json"
+    document = read_json(description)
+    masked: dict[str, str] = {}
     with new_folder(folder) as temporary:
         for frame, mask in masks:
             name = f"{frame.index:04d}-{frame.image.stem}.png"
             write_picture(temporary / name, mask)
-            entries[frame.name]["mask"] = f"{folder.name}/{name}"
+            masked[frame.name] = f"{folder.name}/{name}"
+        if read_json(description) != document:
+            raise DataError(f"{description}: was changed while masks were made; make them again.")
+    for entry in document["frames"]:
+        entry["mask"] = masked[entry["name"]]
     document["provenance"] = {**capture.provenance, "masks": made}
     try:
-        write_json(capture.path / "capture.json", document)
+        write_json(description, document)
     except OutputError:
         with suppress(OutputError):
             remove_folder(folder)  # which nothing names

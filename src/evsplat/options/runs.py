@@ -95,7 +95,7 @@ class Film:
     in_place: Flag = False
     """Leave out the motion's travel along the floor."""
     at: Annotated[float | None, option("S", default="no")] = None
-    """Hold the person at this time of the recording."""
+    """Hold the person, from the first mid-exposure."""
     seconds: Annotated[
         float | None, Above(0), AtMost(86_400), option("S", default="all; 4 with --at")
     ] = None
