@@ -31,6 +31,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 from interruption import KINDS, Disk, Interruption, Outcome, Usual, run  # noqa: E402
+from tests.benching.helpers import untimed  # noqa: E402
 from tests.conftest import write_tiny_capture  # noqa: E402
 from tests.small_model import SMALL  # noqa: E402
 
@@ -350,13 +351,6 @@ def made(out: Path) -> dict[str, str]:
 def _documents(path: Path) -> list[str]:
     text = path.read_text()
     return text.splitlines() if path.suffix == ".jsonl" else [text]
-
-
-def untimed(record: dict[str, object]) -> dict[str, object]:
-    """A record without what depends on the clock, or on who commits to the repository meanwhile."""
-    timed = {"seconds", "train_seconds", "train_cpu_seconds", "evaluate_seconds"}
-    apart = timed | {"peak_memory_mb", "code"}
-    return {key: value for key, value in record.items() if key not in apart}
 
 
 def tensors(path: Path) -> str:

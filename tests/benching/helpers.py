@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -31,18 +32,21 @@ def write_suite(path: Path, captures: dict[str, Path], *rows: dict, iterations: 
 
 
 def records(folder: Path) -> dict[str, dict]:
-    """Record of every cell without what depends on the clock.
+    """Record of every cell, as `untimed` leaves it."""
+    return {
+        path.relative_to(folder / "cells").as_posix(): untimed(json.loads(path.read_text()))
+        for path in sorted((folder / "cells").rglob("*.json"))
+    }
 
-    Without the commit either: the repository may be committed to, or changed, between two cells.
+
+def untimed(record: dict[str, Any]) -> dict[str, Any]:
+    """A record, line of a log or metrics.json without what depends on the clock.
+
+    Without the commit either: the repository may be committed to, or changed, between two of them.
     """
-    apart = {"seconds", "train_seconds", "train_cpu_seconds", "peak_memory_mb", "code"}
-    found = {}
-    for path in sorted((folder / "cells").rglob("*.json")):
-        record = json.loads(path.read_text())
-        found[path.relative_to(folder / "cells").as_posix()] = {
-            key: value for key, value in record.items() if key not in apart
-        }
-    return found
+    timed = {"seconds", "train_seconds", "train_cpu_seconds", "evaluate_seconds"}
+    apart = timed | {"peak_memory_mb", "code"}
+    return {key: value for key, value in record.items() if key not in apart}
 
 
 class _InThisProcess(LocalPool):

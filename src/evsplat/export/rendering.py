@@ -120,9 +120,9 @@ def _check_output(film: Film, out: Path, events_out: Path | str | None, *, ours:
         raise ConfigError(
             "--transparent: mp4 cannot hold it; give --out a name in .webp or .gif or a folder."
         )
-    if events_out is not None and film.show != "events":
-        raise ConfigError("--events: goes with --show events, which simulates them.")
     if events_out is not None:
+        if film.show != "events":
+            raise ConfigError("--events: goes with --show events, which simulates them.")
         written_format(Path(events_out))
     if suffix == ".gif" and film.fps > 50:
         raise ConfigError(f"--fps {film.fps:g}: a GIF plays at most 50 pictures a second.")
