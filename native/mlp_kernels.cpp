@@ -92,11 +92,19 @@ INLINE void add_outer(const float* y, int used, const float* x, int x_panels, fl
 }
 
 INLINE void add_column_sums(const float* x, int panels, float* sum) {
-    for (int p = 0; p < panels; ++p, x += kPanel) {
-        F total = load(sum + p * W);
-        for (int r = 0; r < R; ++r) total = total + load(x + r * W);
-        store(sum + p * W, total);
-    }
+    // A sum waits for the one before it: several panels side by side wait together.
+    const auto some = [&](auto together, int p) {
+        constexpr int n = decltype(together)::value;
+        F total[n];
+        for (int q = 0; q < n; ++q) total[q] = load(sum + (p + q) * W);
+        for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+            for (int q = 0; q < n; ++q) total[q] = total[q] + load(x + (p + q) * kPanel + r * W);
+        for (int q = 0; q < n; ++q) store(sum + (p + q) * W, total[q]);
+    };
+    int p = 0;
+    for (; p + 4 <= panels; p += 4) some(Count<4>{}, p);
+    for (; p < panels; ++p) some(Count<1>{}, p);
 }
 
 INLINE F leaky(F v, F slope) { return select(v > 0.f, v, v * slope); }
@@ -205,31 +213,36 @@ void mlp_backward(const MlpShape& s, const MlpBackward& job, size_t block, const
     float* point = scratch;
     float* both = point + s.point_panels * kPanel;
     float* above = both + s.both_panels * kPanel;
-    float* flow = above + s.out_panels * kPanel;  // at the first layer
-    float* over_times = flow + matrix;
-    float* turns = over_times + matrix;           // two matrices, used in turn
+    float* over_times = above + s.out_panels * kPanel;  // at the first layer, summed
+    float* of_time = over_times + matrix;
+    float* turns = of_time + matrix;  // two matrices, used in turn
 
     const auto zero = [](int, int) { return F{}; };
     pack(f.point, first, s.points, s.per_point, s.point_panels, point);
     for (size_t t = 0; t < s.times; ++t) {
         const float* kept = f.activations + (block * s.times + t) * s.kept();
+        const bool more = t + 1 < s.times || block + 1 < s.blocks;
         pack(job.output_grad + t * s.points * s.out, first, s.points, s.out, s.out_panels, above);
         const float* y = above;
+        float* flow = t ? of_time : over_times;
         for (int l = s.layers - 1; l >= 0; --l) {
             const float* x = kept + l * matrix;
+            // What the next product reads, of the layer before or of the next time's or block's last one.
+            const float* soon = l ? x - matrix : more ? kept + s.kept() + (s.layers - 1) * matrix : x;
             float* next = l ? turns + l % 2 * matrix : flow;
             add_outer(y, s.columns(l), x, s.width_panels, sums.weight[l]);
             add_column_sums(y, s.panels(l), sums.layer_bias[l]);
             const auto end = [&](int p, int r, F a, F b) {
-                const float* seen = x + p * kPanel + r * W;
+                const size_t at = p * kPanel + r * W;
+                const float* seen = x + at;
+                fetch(soon + at), fetch(soon + at + W);
                 to_panels(next)(p, r, leaky_slope(load(seen), a, slope), leaky_slope(load(seen + W), b, slope));
             };
             rows_times(y, s.columns(l), f.layer[l].backward, s.width_panels, zero, end);
             y = next;
         }
         to_first_layer(s, job, first, t, flow, both, sums);
-        for (size_t i = 0; i < matrix; i += W)
-            store(over_times + i, t ? load(over_times + i) + load(flow + i) : load(flow + i));
+        for (size_t i = 0; t && i < matrix; i += W) store(over_times + i, load(over_times + i) + load(flow + i));
     }
     to_points(s, job, first, over_times, point, sums);
 }

@@ -88,6 +88,7 @@ SIZES = [
     ((32, 16, 31), 64, 2, 3),  # the person's colour
     ((47, 0, 0), 64, 2, 3),  # the scene's colour
     ((5, 2, 3), 7, 1, 2),  # no multiple of anything
+    ((5, 2, 3), 88, 2, 2),  # panels whose sums are made side by side, and some more
 ]
 
 
