@@ -1,5 +1,6 @@
 """Videos and folders of pictures: what was put in comes out, with its times."""
 
+import struct
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -124,6 +125,46 @@ def test_a_picture_is_turned_as_its_camera_was_held(tmp_path, orientation, suffi
     expected = UPRIGHT[orientation](stored)
     assert (footage.height, footage.width) == expected.shape[:2] == read.shape[:2]
     assert np.abs(read.astype(int) - expected).max() <= (0 if suffix == ".webp" else 3)
+
+
+DISPLAY_MATRIX = {
+    1: (1, 0, 0, 1),
+    2: (-1, 0, 0, 1),
+    3: (-1, 0, 0, -1),
+    4: (1, 0, 0, -1),
+    5: (0, 1, 1, 0),
+    6: (0, 1, -1, 0),
+    7: (0, -1, -1, 0),
+    8: (0, -1, 1, 0),
+}
+"""The same as a, b, c, d of ISO 14496-12: column p, row q are shown at (a p + c q, b p + d q)."""
+
+
+def write_turned_video(path: Path, picture: np.ndarray, matrix: tuple[int, int, int, int]) -> None:
+    """A lossless video of one picture, whose track header says how it is shown."""
+    with av.open(str(path), "w", format="mov") as container:
+        stream = container.add_stream("png", rate=25)
+        stream.height, stream.width = picture.shape[:2]
+        stream.pix_fmt = "rgb24"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    stored = path.read_bytes()
+    a, b, c, d = (value << 16 for value in matrix)
+    upright = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    at = stored.index(upright, stored.index(b"tkhd"))
+    turned = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path.write_bytes(stored[:at] + turned + stored[at + len(turned) :])
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_a_video_is_turned_and_mirrored_as_its_camera_says(tmp_path, orientation):
+    (stored,) = some_pictures(1)
+    write_turned_video(tmp_path / "clip.mov", stored, DISPLAY_MATRIX[orientation])
+    footage = open_footage(tmp_path / "clip.mov")
+    (read,) = (picture.pixels for picture in footage)
+    expected = UPRIGHT[orientation](stored)
+    assert (footage.height, footage.width) == expected.shape[:2]
+    assert np.array_equal(read, expected)
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".jpg"])

@@ -99,4 +99,20 @@ def _pixels(frame: Any) -> np.ndarray:
             source = _BT709 if frame.height >= _HD_HEIGHT else _BT601
         name = "rgb48le" if deep else "rgb24"
         pixels = frame.reformat(format=name, src_colorspace=source).to_ndarray()
-    return np.ascontiguousarray(np.rot90(pixels, frame.rotation // 90))
+    return np.ascontiguousarray(_upright(pixels, frame))
+
+
+def _upright(pixels: np.ndarray, frame: Any) -> np.ndarray:
+    """Pixels turned by quarters and mirrored as the frame's display matrix says.
+
+    PyAV's ``frame.rotation`` knows no mirror: cameras that film their owner write one.
+    """
+    said = [data for data in frame.side_data if data.type.name == "DISPLAYMATRIX"]
+    if not said:
+        return pixels
+    # column x and row y are shown at (a x + c y, b x + d y)
+    (a, b), (c, d) = np.frombuffer(bytes(said[0]), np.int32).reshape(3, 3)[:2, :2].tolist()
+    if abs(b) + abs(c) > abs(a) + abs(d):
+        pixels = pixels.swapaxes(0, 1)
+        a, d = c, b
+    return pixels[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
