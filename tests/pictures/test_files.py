@@ -10,6 +10,7 @@ from PIL import Image
 
 from evsplat.errors import DataError
 from evsplat.pictures.files import holds_16_bits, read_image, to_unit_range
+from evsplat.untrusted.pictures import image_size
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -25,6 +26,67 @@ def test_a_tiff_keeps_its_depth_however_it_is_packed(
     assert read.dtype == pixels.dtype
     assert holds_16_bits(path) == (kind == "u2")
     assert np.array_equal(read.reshape(pixels.shape), pixels)
+
+
+UPRIGHT = {
+    1: lambda stored: stored,
+    2: lambda stored: stored[:, ::-1],
+    3: lambda stored: stored[::-1, ::-1],
+    4: lambda stored: stored[::-1],
+    5: lambda stored: stored.swapaxes(0, 1),
+    6: lambda stored: stored[::-1].swapaxes(0, 1),
+    7: lambda stored: stored[::-1, ::-1].swapaxes(0, 1),
+    8: lambda stored: stored[:, ::-1].swapaxes(0, 1),
+}
+"""By tag 274 of TIFF 6.0, which says where the stored first row and column are seen."""
+
+
+def write_bare_tiff(path: Path, pixels: np.ndarray, orientation: int) -> None:
+    """A TIFF of one strip, not packed."""
+    height, width, channels = pixels.shape
+    data = pixels.astype(pixels.dtype.newbyteorder("<")).tobytes()
+    start, bits = 8, 8 * pixels.itemsize
+    long, short = 4, 3
+    tags = [
+        (256, long, 1, width),
+        (257, long, 1, height),
+        (258, short, 1, bits),
+        (259, short, 1, 1),
+        (262, short, 1, 2 if channels == 3 else 1),
+        (273, long, 1, start),
+        (274, short, 1, orientation),
+        (277, short, 1, channels),
+        (278, long, 1, height),
+        (279, long, 1, len(data)),
+    ]
+    directory = start + len(data)
+    behind = directory + 2 + 12 * len(tags) + 4
+    if channels == 3:  # whose three numbers of bits do not fit into their line
+        tags[2] = (258, short, 3, behind)
+    lines = b"".join(struct.pack("<HHII", *tag) for tag in tags)
+    path.write_bytes(
+        struct.pack("<2sHI", b"II", 42, directory)
+        + data
+        + struct.pack("<H", len(tags))
+        + lines
+        + struct.pack("<I3H", 0, bits, bits, bits)
+    )
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_a_tiff_is_turned_as_it_says(
+    rng: np.random.Generator, tmp_path: Path, orientation: int, kind: str, channels: int
+) -> None:
+    stored = rng.integers(0, np.iinfo(kind).max, (10, 14, channels), dtype=kind, endpoint=True)
+    path = tmp_path / "p.tif"
+    write_bare_tiff(path, stored, orientation)
+    expected = UPRIGHT[orientation](stored)
+    read = read_image(path)
+    assert read.dtype == stored.dtype
+    assert image_size(path) == expected.shape[1::-1] == read.shape[1::-1]
+    assert np.array_equal(read.reshape(expected.shape), expected)
 
 
 def test_a_bitmap_with_16_bits_of_all_colours_reaches_black_and_white(
