@@ -657,6 +657,42 @@ def test_fault_of_the_errors_of_poses(
     check(the_only(path), path / "body.npz", field, found, expected)
 
 
+def test_a_person_far_from_the_origin_is_a_warning_that_says_how_to_come_near(
+    tiny_capture: Factory,
+) -> None:
+    path = tiny_capture()
+    before = load_capture(path)
+    p = np.array([60_000.0, -80_000.0, 0.0])
+    edit_body(path, transl=lambda a: a.astype(np.float64) + p)
+
+    def moved(sign: int) -> None:
+        cameras = json.loads((path / "capture.json").read_text())["cameras"]
+        for name in cameras:
+            pose = np.array(cameras[name]["world_to_camera"])
+            pose[:3, 3] += sign * pose[:3, :3] @ p
+            edit_json(path, "cameras", name, "world_to_camera", value=pose.tolist())
+
+    moved(-1)
+    finding = the_only(path, "warning")
+    check(finding, path / "body.npz", "transl", "100,000 m from the origin", "within 300 m")
+    assert "7.8 mm" in finding.found and "p = (60000, -80000, 0)" in finding.remedy
+    # what the remedy says brings every camera back to where it saw the person before
+    moved(+1)
+    edit_body(path, transl=lambda a: a - p)
+    assert not validate_capture(path)
+    after = load_capture(path)
+    for name, camera in before.cameras.items():
+        difference = camera.world_to_camera - after.cameras[name].world_to_camera
+        assert difference.abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("away_m", [0.0, 290.0])
+def test_a_person_near_the_origin_is_not_told(tiny_capture: Factory, away_m: float) -> None:
+    path = tiny_capture()
+    edit_body(path, transl=lambda a: a * 0 + np.array([0.0, 0.0, away_m]))
+    assert not validate_capture(path)
+
+
 def test_infinite_translation_names_the_pose(tiny_capture: Factory) -> None:
     path = tiny_capture()
 

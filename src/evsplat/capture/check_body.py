@@ -20,6 +20,8 @@ _WEIGHT_SUM_TOLERANCE = 1e-3
 _COVERAGE_IN_SPACINGS = 0.6
 _LARGEST = 1e6
 """Of metres, radians and weights."""
+_FAR_M = 300.0
+"""From the world's origin. 20 steps with float32 places lost 0.02 dB 100 m off, 0.34 at 2.2 km."""
 _REWRITE = "Write body.npz anew with this shape."
 
 
@@ -36,6 +38,7 @@ def check_body(metadata: Metadata, findings: Findings, *, deep: bool) -> None:
     check.body(metadata.body_model, metadata.body_source)
     if findings.error_count() == before:
         _check_coverage(metadata, arrays, findings)
+        _check_distance(metadata.body_file, arrays["transl"], findings)
     dense = metadata.path / "body_dense.npz"
     if deep and dense.exists():
         check_dense(dense, _read(dense, findings), check.joint_count(), findings)
@@ -312,3 +315,21 @@ def _check_coverage(metadata: Metadata, arrays: dict[str, np.ndarray], findings:
         f"{int(times[0])}..{int(times[-1])} us",
         "Add the poses, or remove these frames from capture.json.",
     )
+
+
+def _check_distance(path: Path, transl: np.ndarray, findings: Findings) -> None:
+    """A warning where places of the person have too few digits left, as in a map's coordinates."""
+    place = np.median(transl.astype(np.float64), axis=0)
+    distance_m = float(np.linalg.norm(place))
+    if distance_m > _FAR_M:
+        step_mm = float(np.spacing(np.float32(distance_m))) * 1000
+        near = ", ".join(f"{value:.0f}" for value in place)
+        findings.warning(
+            path,
+            "transl",
+            f"a person {distance_m:,.0f} m from the origin of the world, where places are known "
+            f"to {step_mm:.2g} mm and training moves nothing by less",
+            f"one within {_FAR_M:.0f} m of it",
+            f"Move the origin there: subtract p = ({near}) from transl and points.ply, and add "
+            "R p to t of each world_to_camera [R t].",
+        )
