@@ -5,8 +5,8 @@ import torch
 
 from evsplat.gaussians import Adam, step_together
 
-SHAPES = ((40, 3), (40, 4), (7,), ())
-RATES = (1e-2, 3e-3, 1e-2, 0.0)
+SHAPES = ((40, 3), (40, 4), (7,), (), (11_000, 3))  # the last one by all threads
+RATES = (1e-2, 3e-3, 1e-2, 0.0, 1e-2)
 
 
 def adams(kind, **more):
