@@ -16,7 +16,7 @@ from evsplat.capture import Capture, Policy, load_capture
 from evsplat.capture.policy import Terms, terms_of
 from evsplat.cli.runs import summary_table
 from evsplat.disk import held
-from evsplat.errors import DataError
+from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
 from evsplat.evaluation.event_maps import chosen_pairs
@@ -115,6 +115,17 @@ def test_training_frames_without_truth_are_refused(tiny_capture, tmp_path):
     with pytest.raises(DataError, match=said):
         evaluate(capture, TruthWithNoise(capture), out_dir=tmp_path / "run", split="train")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("split", ["val", "Train", "", None])
+def test_a_split_that_there_is_none_of_is_refused(tiny_capture, tmp_path, split):
+    capture = load_capture(tiny_capture())
+    said = f"--split {split}: expected test or train"
+    with pytest.raises(ConfigError, match=said):
+        evaluate(capture, TruthWithNoise(capture), out_dir=tmp_path / "run", split=split)
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(ConfigError, match=said):
+        evaluation_run.write_report(tmp_path, split=split)
 
 
 def test_a_person_who_is_in_no_frame_is_remarked(tiny_capture, tmp_path, caplog):

@@ -32,6 +32,7 @@ from evsplat.evaluation.protocols import (
     without_reasons,
 )
 from evsplat.evaluation.regions import Absent, HumanRegions
+from evsplat.evaluation.splits import check_split
 from evsplat.evaluation.tables import missing_networks
 from evsplat.meanwhile import meanwhile
 from evsplat.methods.reconstruction import Reconstruction
@@ -89,8 +90,10 @@ def evaluate(
     memory does not grow with the length of the recording.
 
     Raises:
+        ConfigError: ``split`` is another word.
         DataError: no training frame has a sharp truth and ``split`` is "train".
     """
+    check_split(split)
     frames = _frames_of(capture, split)
     out_dir = Path(out_dir)
     networks, weights = _load_networks(lpips_weights, device)

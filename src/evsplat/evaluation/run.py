@@ -10,7 +10,7 @@ from evsplat.config import to_dict
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
-from evsplat.evaluation.splits import name_of
+from evsplat.evaluation.splits import check_split, name_of
 from evsplat.evaluation.tables import write_tables
 from evsplat.files import held_folder, try_target, write_json, write_text
 from evsplat.options.inputs import check_run_folder
@@ -46,6 +46,7 @@ def write_report(run_dir: Path | str, *, split: Split = "test") -> Path:
 
     Figures and rendered pictures come from what `evaluate_run` wrote; the clip is drawn anew.
     """
+    check_split(split)
     with _in_turn(Path(run_dir)):
         return _reported(load_run(Path(run_dir)), Path(run_dir), split)
 

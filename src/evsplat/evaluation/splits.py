@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from evsplat.errors import ConfigError
 from evsplat.options.runs import Split
 from evsplat.wording import counted
 
@@ -34,6 +35,12 @@ WORDS: dict[Split, SplitWords] = {
         "blurry input itself (training saw it)",
     ),
 }
+
+
+def check_split(split: str) -> None:
+    """A `ConfigError` for any other word, as of a caller in Python, whose words nobody checks."""
+    if split not in WORDS:
+        raise ConfigError(f"--split {split}: expected {' or '.join(WORDS)}.")
 
 
 def split_of(metrics: dict[str, Any]) -> Split:
