@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from evsplat.gaussians.initialise import pixel_rays
 from evsplat.methods.furniture import behind_things, furnished
 
 from .rooms import HEIGHT_M, Crate, camera_over, met, painted, pillar, room_of
@@ -26,6 +27,25 @@ def test_a_crate_is_nearer_than_the_wall_behind_it(seed, roll):
     assert (bare / depth - 1)[there].median() > 0.1
     assert wrong[there].median() < 0.06
     assert (shares[~there] == 1).float().mean() > 0.995
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_front_leans_half_as_much_as_what_leads_back_to_its_upper_end(seed):
+    rng = np.random.default_rng(seed)
+    room, camera = (
+        room_of(5.0, 3.0, 3.0, feet=(0.3, 2.5)),
+        camera_over(rng.uniform(-0.2, 0.1), 0.15),
+    )
+    left, front, top = rng.uniform(-1.2, -0.6), rng.uniform(3.6, 4.2), rng.uniform(-0.7, -0.4)
+    crate = Crate((left, front, -HEIGHT_M), (left + 0.8, front + 0.7, top))
+    shares = furnished(camera, painted(room, camera, rng, crate), room, pillar(0.3, 2.5))
+    which, depth = met(room, camera, crate)
+    _, away, height = (depth[..., None] * pixel_rays(camera)).unbind(-1)
+    upper = (which == len(room.normals)) & (away < front + 0.01) & (height > top - 0.3)
+    wrong = (shares * room.depth(camera) / depth - 1).abs()
+    assert upper.sum() > 50
+    # Of the way to the wall, 5 m away: half of that would be if it leant all the way back.
+    assert wrong[upper].median() < 0.25 * (1 - front / 5)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -2,8 +2,10 @@
 
 It looks neither like the floor nor like the walls, ends at edges, and its neighbouring columns end
 at about the same heights. What is upright is as far away as where it meets the floor (Hoiem, Efros
-and Hebert, Automatic Photo Pop-up, SIGGRAPH 2005); as seats and table tops lead back to the wall,
-its upper end is taken to be half as far before it.
+and Hebert, Automatic Photo Pop-up, SIGGRAPH 2005). Its front is upright up to the strongest edge
+within it, from where a level seat leads back to what stands two thirds of the way to the wall, or
+it leans back all the way to its upper end, half as far before the wall. One picture does not tell
+which, and feet are known to a row or three, so the mean of both is taken.
 """
 
 from dataclasses import dataclass
@@ -11,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_dilation, maximum_filter
+from scipy.ndimage import binary_dilation, maximum_filter, uniform_filter1d
 from torch import Tensor
 
 from evsplat.camera import Camera
@@ -30,6 +32,8 @@ share of floor and walls that may look otherwise."""
 _EDGE, _USUAL = 8.0, 0.7
 """Worth of an edge at a foot or an upper end, and how much of one makes an end neither likelier nor
 less likely."""
+_SHADES = (0.9, 0.8, 0.7)
+"""Brightness of the floor in the shade of what stands on it."""
 _RISE_M = 0.2
 """Least height at which a thing ends before the wall: skirting boards are lower."""
 _FAR = 2.0
@@ -40,8 +44,12 @@ counts."""
 _RIM_PX, _CELL_PX, _WIDTH = 2, 2, 0.75
 """Width of a thing's rim, whose colours are in part its own; side of the squares of what is behind
 it, of which each has a Gaussian, and its standard deviation in them."""
-_LEADS_BACK = 0.5
-"""Share of the way to the wall that its upper end is farther than its foot, in inverse depth."""
+_LEADS_BACK, _BACK = 0.5, 0.65
+"""Share of the way to the wall that the upper end of what leans, and the back of what has a seat,
+are farther than the foot, in inverse depth."""
+_AROUND, _LEVEL = 5, 0.02
+"""Columns whose mean edge tells where a front ends, and the slope of sight from which on the top of
+what is lower than the camera is seen."""
 
 
 def furnished(
@@ -109,8 +117,8 @@ def _shares(lines: Lines, room: Room) -> Float[Tensor, "H W"]:
     anything = colours.of(np.ones(floor.shape))
     surely, wall, thing = near, 1.0 * (planes[..., 0] < 0).numpy(), anything
     shares = torch.ones(floor.shape)
-    for _ in range(_ROUNDS):
-        empty = np.where(floor, colours.of(surely * floor), colours.of(wall))
+    for shades in [()] * (_ROUNDS - 1) + [_SHADES]:
+        empty = np.where(floor, colours.of(surely * floor, shades), colours.of(wall))
         unlike = np.log(thing + 1e-9) - np.log((1 - _ANYTHING) * empty + 1e-9)
         gains = upright.seen(np.clip(unlike, -_SURE, _SURE) - _PRICE)
         shares = upright.shares(gains, edges)
@@ -129,6 +137,10 @@ class _Upright:
 
     inverse: Float[np.ndarray, "H W P"]
     """Inverse depth of the room's planes."""
+    slopes: Float[np.ndarray, " H"]
+    """Fall of the rows' sight per metre."""
+    height_m: float
+    """Of the camera above the floor."""
     risen: Bool[np.ndarray, "H W"]
     """Higher than `_RISE_M` before what stands behind the floor."""
     pixels: tuple[Int[np.ndarray, "H W"], Int[np.ndarray, "H W"]]
@@ -156,7 +168,13 @@ class _Upright:
         lowest = inverse[..., 1:].max(-1) * (height_m - _RISE_M)
         risen = rows.numpy()[:, None] < lowest
         return _Upright(
-            inverse, risen, (y.numpy(), x.numpy()), inside.numpy(), (row.numpy(), column.numpy())
+            inverse,
+            rows.numpy(),
+            height_m,
+            risen,
+            (y.numpy(), x.numpy()),
+            inside.numpy(),
+            (row.numpy(), column.numpy()),
         )
 
     def seen(self, values: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
@@ -168,15 +186,36 @@ class _Upright:
     ) -> Float[Tensor, "H W"]:
         """Of the picture's pixels, of what stands where it is likeliest, see `stixels`."""
         nearest, floor = self.inverse.max(-1), self.inverse.argmax(-1) == 0
+        # Of an edge between a row and the one above.
+        breaks = uniform_filter1d(np.roll(edges, 1, 0), _AROUND, axis=1)
         shares = np.ones_like(nearest)
         for at, ends in enumerate(stixels(gains, edges, floor, self.risen)):
             if ends is not None:
                 top, foot = ends
                 below = self.inverse[min(foot + 1, len(nearest) - 1), at, 0]
-                back = _LEADS_BACK * np.linspace(1, 0, foot - top + 1)
-                thing = below + (nearest[top, at] - below) * back
+                strip, wall = slice(top, foot + 1), nearest[top, at]
+                upright = self._front_and_seat(strip, below, wall, breaks[:, at])
+                leaning = below + (wall - below) * np.linspace(_LEADS_BACK, 0, foot - top + 1)
+                thing = (upright + leaning) / 2
                 shares[top : foot + 1, at] = np.minimum(nearest[top : foot + 1, at] / thing, 1)
         return torch.from_numpy(shares[self.places]).float()
+
+    def _front_and_seat(
+        self, strip: slice, foot: float, wall: float, breaks: Float[np.ndarray, " H"]
+    ) -> Float[np.ndarray, " R"]:
+        """Inverse depth in the rows of a strip: of an upright front, a level seat, and a back.
+
+        ``foot`` and ``wall``: that of the front, and of the wall behind. The front ends where
+        ``breaks`` is most.
+        """
+        slopes = self.slopes[strip]
+        risen = (slopes > _LEVEL) & (self.height_m - slopes / foot > _RISE_M)
+        risen[:2] = False  # Edges at the upper end are its own.
+        if not risen.any():
+            return np.full(len(slopes), foot)
+        end = np.where(risen, breaks[strip], -np.inf).argmax()
+        seat = np.maximum(foot * slopes / slopes[end], foot + _BACK * (wall - foot))
+        return np.where(np.arange(len(slopes)) < end, seat, foot)
 
 
 def _cells(
