@@ -40,7 +40,8 @@ def test_what_is_sure_moves_by_no_more_than_its_share():
 
 
 @pytest.mark.parametrize("tint", [0.0, 3.0])
-def test_conjugate_gradients_find_the_least_squares(tint):
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_conjugate_gradients_find_the_least_squares(tint, elsewhere):
     generator = torch.Generator().manual_seed(0)
     seen = torch.randn(9, 6, generator=generator, dtype=torch.float64)
     pictures = torch.randn(9, 3, generator=generator, dtype=torch.float64)
@@ -53,7 +54,8 @@ def test_conjugate_gradients_find_the_least_squares(tint):
     def squares(values):
         return seen.T @ (seen @ values)
 
-    found = closest(prior, pull, squares, diagonal, strength, hue, 18)
+    start = torch.rand(6, 3, generator=generator, dtype=torch.float64) if elsewhere else None
+    found = closest(prior, pull, squares, diagonal, strength, hue, 18, start)
     # All 18 unknowns at once, a row's three colours beside each other.
     of_hue = torch.eye(3, dtype=torch.float64) - 1 / 3
     price = torch.kron(strength.diag(), torch.eye(3)) + torch.kron(hue.diag(), of_hue)

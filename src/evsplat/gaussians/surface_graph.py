@@ -103,18 +103,22 @@ def closest(
     strength: Float[Tensor, " N"],
     hue: Float[Tensor, " N"],
     steps: int,
+    start: Float[Tensor, "N C"] | None = None,
 ) -> Float[Tensor, "N C"]:
     """Values x that minimise ``|J x - b|^2 + sum strength d^2 + hue (d - mean of d over C)^2``.
 
     d is ``x - prior``: what all C columns have in common is brightness, the rest hue. ``pull``:
     ``J^T (b - J prior)``; ``seen`` applies ``J^T J``, whose ``diagonal`` is known more or less:
     ``steps`` of conjugate gradients conditioned by it, one being enough where there is nothing but
-    it.
+    it. ``start``: where they begin, otherwise at ``prior``.
     """
     held, tinted = strength.double()[:, None], hue.double()[:, None]
     scale = diagonal.double()[:, None] + held
     change = torch.zeros_like(prior, dtype=torch.float64)
     left = pull.double()
+    if start is not None:
+        change = start.double() - prior.double()
+        left = left - seen(change.to(prior)).double() - _by_parts(change, held, held + tinted)
     ahead = _by_parts(left, 1 / scale, 1 / (scale + tinted))
     direction, size = ahead, (left * ahead).sum()
     least = torch.finfo(size.dtype).tiny

@@ -40,6 +40,7 @@ from evsplat.models.discs import DiscModel
 from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
 from evsplat.models.discs.outskirts import outskirts
+from evsplat.models.discs.pictured import pictured
 from evsplat.models.seen import Seen
 from evsplat.objectives import (
     DeformationPrior,
@@ -221,7 +222,8 @@ def _filled(
     gaussians = model.gaussians
     name = f"gaussians.{gaussians.colour}"
     colours = decided.get(name, gaussians.get_parameter(gaussians.colour)).detach().clone()
-    colours[gaussians.scene] = outskirts(gaussians, cameras, model.low_pass).logit()
+    of_scene = pictured(gaussians, cameras[0], model.low_pass) if len(cameras) == 1 else None
+    colours[gaussians.scene] = outskirts(gaussians, cameras, model.low_pass, of_scene).logit()
     return decided | {name: colours}
 
 

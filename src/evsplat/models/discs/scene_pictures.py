@@ -1,0 +1,93 @@
+"""Pictures of the scene alone, as linear functions of its colours."""
+
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
+from operator import add
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from evsplat.camera import Camera
+from evsplat.gaussians import GaussianSet
+from evsplat.gaussians.surround import cell_px
+from evsplat.models.discs.still import Still
+from evsplat.models.seen import fixed, shares_by, transposed
+from evsplat.render import render
+
+_FARTHER = 1.15
+"""Least depth of what is hidden as a share of the picture's there."""
+
+
+class ScenePictures:
+    """Of cameras of one size; ``J`` are the shares that the scene's Gaussians have of all pixels.
+
+    ``colours``, sRGB, are the scene's own, and ``before`` the pictures with them.
+    """
+
+    def __init__(
+        self,
+        gaussians: GaussianSet,
+        views: Sequence[Camera],
+        low_pass: float,
+        colours: Float[Tensor, "S 3"] | None = None,
+    ) -> None:
+        """``colours`` in place of those of ``gaussians``."""
+        self.views, self._low_pass = views, low_pass
+        with torch.no_grad():
+            scene = Still.of(gaussians, None, hard_semantics=True).scene.with_times()
+        own = scene.channels[..., :3] if colours is None else colours[None]
+        self._scene = fixed(scene, own)
+        self.colours = own[0]
+        self.means = self._scene.means[0]
+        with torch.no_grad():
+            self.before = [self.draw(own, view) for view in views]
+
+    def draw(self, values: Float[Tensor, "1 S C"], view: Camera) -> Float[Tensor, "1 H W C"]:
+        """A picture with these in place of colours."""
+        return render(fixed(self._scene, values), view, low_pass=self._low_pass).image
+
+    def twice(self, values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
+        """``J^T J values``."""
+        return self._over(values, lambda drawn, _: drawn)
+
+    def missing(self, values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
+        """``J^T`` of what the pictures of these colours lack of those before."""
+        return self._over(values, lambda drawn, index: self.before[index] - drawn)
+
+    def squares(self) -> list[Float[Tensor, " S"]]:
+        """Of each view, the sums of the squared shares; estimates without bias."""
+        generator = torch.Generator().manual_seed(0)
+        shares = [
+            shares_by(partial(self.draw, view=view), self.means[None], generator)
+            for view in self.views
+        ]
+        return [each[:, 1:].square().mean(1) for each in shares]
+
+    def cells_beyond(self, view: Camera) -> Float[Tensor, " S"]:
+        """Cells of the surround from a picture's border to what is outside; negative within."""
+        places, depth = view.project(self.means)
+        size = places.new_tensor([view.width, view.height])
+        cell = cell_px(view.width, view.height)
+        beyond = ((places - size / 2).abs() - size / 2).amax(-1) / cell
+        return beyond.where(depth > 0, torch.inf)
+
+    def behind(self, view: Camera) -> Bool[Tensor, " S"]:
+        """What lies within a picture, well behind the depth that is seen there."""
+        x, y, depth, inside = view.pixels(self.means)
+        values = torch.stack([depth, torch.ones_like(depth)], -1)[None]
+        with torch.no_grad():
+            sums = self.draw(values, view)[0]
+        depths, shares = sums[y, x].unbind(-1)
+        return inside & (depth * shares > _FARTHER * depths)
+
+    def _over(
+        self, values: Float[Tensor, "S 3"], weights: Callable[[Tensor, int], Tensor]
+    ) -> Float[Tensor, "S 3"]:
+        """Sum over all views of ``J^T weights``, of a picture with these values and its number."""
+        sums: list[Tensor] = []
+        for index, view in enumerate(self.views):
+            leaf = values[None].clone().requires_grad_()
+            image = self.draw(leaf, view)
+            sums.append(transposed(image, leaf, weights(image.detach(), index))[0])
+        return reduce(add, sums)
