@@ -4,6 +4,7 @@ import dataclasses
 import types
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 
@@ -75,6 +76,7 @@ def expected(hint: Any, ranges: Sequence[Range] = (), *, many: bool = False) -> 
         float: ("a number", "numbers"),
         bool: ("true or false", "true or false"),
         str: ("a text", "texts"),
+        Path: ("a path", "paths"),
         type(None): ("null", "null"),
     }.get(hint, (str(hint), str(hint)))
     bounds = " and ".join(bound.words for bound in ranges if hint in (int, float))

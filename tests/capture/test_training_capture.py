@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evsplat.capture import Frame, Policy, load_body_track, load_capture
-from evsplat.capture.policy import Terms
+from evsplat.capture.policy import Terms, terms_of
 from evsplat.capture.training_capture import held_out_spans, readable_spans
-from evsplat.errors import DataError, HeldOutError
+from evsplat.errors import ConfigError, DataError, HeldOutError
 from evsplat.events import ALWAYS
 from evsplat.masks import MASKERS
 
@@ -256,3 +256,22 @@ def test_neighbours_end_at_held_out_frames(tiny_capture):
     for frame in capture.train_frames:
         first = 0 if frame.index < 7 else 10
         assert [f.index for f in capture.neighbours(frame)] == list(range(first, first + 7))
+
+
+@pytest.mark.parametrize(
+    "misspelt",
+    [
+        {"use": "all"},
+        {"thresholds": "Estimated"},
+        {"masks": None},
+        {"held_out_events": "no"},
+        {"held_out_poses": "hidden"},
+    ],
+)
+def test_a_policy_is_of_words_that_there_are(misspelt):
+    ((name, value),) = misspelt.items()
+    said = f"--{name.replace('_', '-')} '?{value}'?"
+    with pytest.raises(ConfigError, match=f"{said}: expected "):
+        Policy(**misspelt)
+    with pytest.raises(ValueError, match="expected "):  # of a file: no option of its reader's
+        terms_of({"policy": misspelt})

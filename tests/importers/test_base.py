@@ -1,9 +1,11 @@
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from evsplat.errors import ConfigError
+from evsplat.errors import ConfigError, DataError
+from evsplat.importers import import_capture
 from evsplat.importers.base import chosen_frames, shrunk
 
 
@@ -41,3 +43,29 @@ def test_frames_that_end_before_they_begin_are_told_so(frames):
     with pytest.raises(ConfigError, match=r"^--frames \d \d: expected the first frame and the one"):
         chosen_frames(frames, list(range(10)), Path("clip.mp4"))
     assert chosen_frames((5, 6), list(range(10)), Path("clip.mp4")) == [5]
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "said"),
+    [
+        ("video", {"frames": (3,)}, "--frames 3: expected [an integer, an integer]"),
+        ("video", {"shrink": 1.5}, "--shrink 1.5: expected an integer"),
+        ("video", {"focal": "900"}, "--focal '900': expected a number"),
+        ("davis", {"contrast": (0.2,)}, "--contrast 0.2: expected [a number, a number]"),
+        ("folder", {"clock_offset_us": "aut"}, "--clock-offset-us aut: expected an integer or"),
+    ],
+)
+def test_options_of_another_type_are_refused_before_the_source_is_read(
+    tmp_path, kind, options, said
+):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        import_capture(kind, tmp_path / "nothing", tmp_path / "out", **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"frames": [3, 9]}, {"clock_offset_us": "auto"}, {"homography": "h.txt"}, {"focal": 900}],
+)
+def test_options_of_the_type_are_taken_and_the_source_is_looked_for(tmp_path, options):
+    with pytest.raises(DataError, match="nothing"):
+        import_capture("video", tmp_path / "nothing", tmp_path / "out", **options)

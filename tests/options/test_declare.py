@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
+import numpy as np
 import pytest
 import tyro
 
@@ -46,6 +47,16 @@ class Lamp:
         ({"colour": "blue"}, "--colour blue: expected one of warm, cold."),
         ({"turn_deg": float("inf")}, "--turn inf"),
         ({"hours": (3, -1)}, "--hours 3 -1: expected a list of integers of at least 0."),
+        ({"watts": "40"}, "--watts '40': expected a number of at least 1."),
+        ({"watts": None}, "--watts None: expected a number of at least 1."),
+        ({"watts": True}, "--watts True: expected a number"),
+        ({"count": 2.5}, "--count 2.5: expected an integer of at least 1."),
+        ({"count": 2.0}, "--count 2.0: expected an integer of at least 1."),
+        ({"count": "2"}, "--count '2': expected an integer of at least 1."),
+        ({"colour": None}, "--colour None: expected one of warm, cold."),
+        ({"dimmed": "no"}, "--dimmed 'no': expected true or false."),
+        ({"hours": 3}, "--hours 3: expected a list of integers of at least 0."),
+        ({"hours": (3, 4.5)}, "--hours 3 4.5: expected a list of integers of at least 0."),
         ({"wats": 3}, "wats: no such option; did you mean watts?"),
     ],
 )
@@ -54,6 +65,21 @@ def test_bad_values_are_one_sentence_with_the_options_name(changes, message, sta
     with pytest.raises(ConfigError) as raised:
         given(Lamp, start, changes)
     assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"watts": 60},
+        {"watts": np.float32(60)},
+        {"count": np.int64(2)},
+        {"count": None},
+        {"hours": [3, 4]},
+        {"dimmed": np.bool_(True)},
+    ],
+)
+def test_numbers_of_numpy_and_lists_are_taken(changes):
+    assert vars(given(Lamp, None, changes)).items() >= changes.items()
 
 
 @pytest.mark.parametrize(

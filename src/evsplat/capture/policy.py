@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from evsplat.errors import ConfigError
-from evsplat.options.declare import Use
+from evsplat.options.declare import Use, check_options
 
 Masks = Literal["given", "estimated", "none"]
 EventUse = Literal["amounts", "direction", "nothing"]
@@ -36,6 +36,9 @@ class Policy:
     held_out_poses: Literal["given", "interpolated"] = "given"
     """``interpolated``: key poses inside held-out intervals are not seen either, and the person's
     pose there is interpolated from those of training frames."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def require_held_out_events(self, setting: str) -> None:
         """A `ConfigError` where a ``setting`` that wants them is on and they are hidden."""
@@ -138,4 +141,7 @@ STRICT_TERMS = (
 def terms_of(metrics: dict[str, Any]) -> Terms | None:
     """The terms in a metrics.json or a bench record; None where it has none."""
     values = metrics.get("policy")
-    return None if values is None else Terms(**values)
+    try:
+        return None if values is None else Terms(**values)
+    except ConfigError as error:  # no option of the reader's: what a file holds
+        raise ValueError(str(error)) from None

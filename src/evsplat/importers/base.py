@@ -12,7 +12,7 @@ from jaxtyping import Float
 from evsplat.capture.parse_cameras import SMALLEST_PX
 from evsplat.capture.write import CaptureWriter
 from evsplat.errors import ConfigError, DataError
-from evsplat.options.declare import LAST, Flag
+from evsplat.options.declare import LAST, Flag, check_options
 from evsplat.pictures.files import read_image
 from evsplat.pictures.light import Transfer
 from evsplat.pictures.squares import square_means
@@ -41,6 +41,9 @@ class Importer:
 
     brings_masks: ClassVar[bool] = False
     """Whether masks come with the data set, so that missing ones are told."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read ``source`` into ``writer``; gives notes for the user.

@@ -15,7 +15,6 @@ from evsplat.footage import Footage, TimedPicture, open_footage
 from evsplat.importers.base import (
     GUIDE,
     Importer,
-    check_positive,
     chosen_frames,
     exposure_around,
     human_mask,
@@ -165,8 +164,6 @@ class Folder(Importer):
                 f"{source}: is a file, expected the folder of the recording; a video alone is read "
                 "by 'evsplat import video', a DAVIS recording by 'evsplat import davis'."
             )
-        if self.fps is not None:
-            check_positive(fps=self.fps)
         images = self._images(source)
         footage = open_footage(images, self._rate(source, images), rate_option="--fps")
         return footage, self._exposures(source, footage)
@@ -207,7 +204,6 @@ class Folder(Importer):
                 f"{source}: how long the shutter was open is not known; give --exposure-us, or the "
                 "start and end of every exposure in exposures.txt."
             )
-        check_positive(exposure_us=self.exposure_us)
         times = footage.times_us + self.start_us
         return np.array([exposure_around(int(time), self.exposure_us) for time in times])
 

@@ -62,7 +62,7 @@ class Mmhpsd(Importer):
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read one action; see `Importer.write`."""
-        check_positive(shrink=self.shrink, fps=self.fps, event_duty=self.event_duty)
+        check_positive(shrink=self.shrink, event_duty=self.event_duty)
         if self.event_duty > 1:
             raise ConfigError(
                 f"--event-duty {self.event_duty:g}: expected a share of a frame's interval, at "

@@ -47,7 +47,7 @@ class Neuman(Importer):
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read one sequence; see `Importer.write`."""
-        check_positive(shrink=self.shrink, fps=self.fps)
+        check_positive(shrink=self.shrink)
         need(source, "one sequence of NeuMan")
         pictures = numbered(need(source / "images", "the pictures"), "pictures", PICTURES)
         scene = read_colmap(source / "sparse")

@@ -19,7 +19,7 @@ from evsplat.events import EventStream, open_recording
 from evsplat.events.formats.base import SAY_UNIT
 from evsplat.events.homography import Mover
 from evsplat.footage import Footage, TimedPicture
-from evsplat.importers.base import check_positive, need, shrunk, shrunk_view
+from evsplat.importers.base import need, shrunk, shrunk_view
 from evsplat.importers.clock_offset import found_offset
 from evsplat.importers.place_finder import PlaceFinder
 from evsplat.pictures.files import to_unit_range
@@ -48,7 +48,6 @@ def recorded_camera(
             raise ConfigError(f"--focal: {file} holds the camera; give one of the two.")
         return read_camera(need(file, "the camera"), width, height), "calibrated", ""
     if focal_px is not None:
-        check_positive(focal=focal_px)
         origin, note = "given", ""
     else:
         focal_px = max(width, height) / 2 / float(np.tan(np.radians(GUESSED_FOV_DEG) / 2))

@@ -8,7 +8,6 @@ from evsplat.errors import ConfigError
 from evsplat.footage import open_footage
 from evsplat.importers.base import (
     Importer,
-    check_positive,
     chosen_frames,
     exposure_around,
     short_exposure,
@@ -79,7 +78,6 @@ class Video(Importer):
                 f"{source}: how long the shutter was open is not known, and blur is made of it; "
                 "give --exposure-us."
             )
-        check_positive(exposure_us=self.exposure_us)
         size = footage.width, footage.height
         mover = given_mover(self.homography, size)
         camera, focal, note = recorded_camera(self.camera, self.focal, size)

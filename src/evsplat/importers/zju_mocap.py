@@ -60,7 +60,7 @@ class ZjuMocap(Importer):
 
     def write(self, source: Path, writer: CaptureWriter, smpl: Path | None) -> list[str]:
         """Read one subject's folder; see `Importer.write`."""
-        check_positive(shrink=self.shrink, fps=self.fps)
+        check_positive(shrink=self.shrink)
         sequence = _open(source)
         for name in (self.camera, *self.novel_cameras):
             if name not in sequence.cameras:

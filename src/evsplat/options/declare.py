@@ -4,8 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from difflib import get_close_matches
+from numbers import Integral, Real
+from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -93,24 +96,55 @@ def given(kind: type[Options], options: Options | None, changes: Mapping[str, An
 
 
 def check_options(options: Any) -> None:
-    """Raise a `ConfigError` that names the first option out of its range or choices."""
+    """Raise a `ConfigError` that names the first option of another type or out of its range."""
     kind = type(options)
     plain, marked = get_type_hints(kind), get_type_hints(kind, include_extras=True)
     for name, hint in plain.items():
         value, marks = getattr(options, name), getattr(marked[name], "__metadata__", ())
-        if value is None:
-            continue
-        choices = [word for part in (hint, *get_args(hint)) for word in _words(part)]
         ranges = [mark for mark in marks if isinstance(mark, Range)]
-        fits = not choices or value in choices
-        if isinstance(value, float) and not math.isfinite(value):
-            fits = False
-        numbers = value if isinstance(value, tuple) else (value,)
-        if not fits or not all(number in allowed for number in numbers for allowed in ranges):
+        parts = value if isinstance(value, tuple | list) else (value,)
+        numbers: list[Any] = [part for part in parts if isinstance(part, Real)]
+        is_of_type = _is_of(value, hint)
+        if not is_of_type or not all(number in allowed for number in numbers for allowed in ranges):
             said = next((mark.name for mark in marks if getattr(mark, "name", None)), name)
-            shown = " ".join(f"{n:g}" if isinstance(n, float) else str(n) for n in numbers)
+            # 2.0 and '2' in the place of a whole number would look like one
+            exact = not is_of_type and not _has_choices(hint)
+            shown = " ".join(repr(part) if exact else _short(part) for part in parts)
             wanted = expected(marked[name]).removesuffix(" or null")
             raise ConfigError(f"--{said.replace('_', '-')} {shown}: expected {wanted}.")
+
+
+def _is_of(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type, as the command line's are; numbers are finite.
+
+    Paths may be texts, and types that stand in no command line are not looked at.
+    """
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_is_of(value, argument) for argument in arguments)
+    if origin is Literal:
+        return value in arguments
+    if origin is tuple:
+        if not isinstance(value, tuple | list):
+            return False
+        kinds = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        return len(kinds) == len(value) and all(map(_is_of, value, kinds))
+    if hint in (int, float):
+        number = isinstance(value, Integral if hint is int else Real)
+        return number and not isinstance(value, bool) and math.isfinite(value)
+    if hint in (str, Path):
+        return isinstance(value, str | PathLike)
+    if hint is bool:
+        return value in (False, True)
+    return value is None if hint is type(None) else True
+
+
+def _has_choices(hint: Any) -> bool:
+    return any(get_origin(part) is Literal for part in (hint, *get_args(hint)))
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def check_twins(options: Any, overrides: Sequence[str], twins: Mapping[str, str]) -> None:
@@ -126,8 +160,3 @@ def check_twins(options: Any, overrides: Sequence[str], twins: Mapping[str, str]
                 raise ConfigError(
                     f"--{name.replace('_', '-')} {value}: --set gives {key} as well; leave one out."
                 )
-
-
-def _words(hint: Any) -> tuple[Any, ...]:
-    """Choices of a ``Literal``; nothing of another type."""
-    return get_args(hint) if get_origin(hint) is Literal else ()
