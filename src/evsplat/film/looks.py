@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt16
 
 from evsplat.camera import Camera
 from evsplat.errors import ConfigError
+from evsplat.film.gaps import close_gaps
 from evsplat.film.surroundings import CalmRoom, Painted
 from evsplat.methods.reconstruction import Parts
 from evsplat.options.runs import Shown
@@ -58,6 +59,8 @@ class Look:
         if self.shown == "events":
             coded = encode(luminance(decode(rgb, self.transfer)))
             return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
+        if self.surroundings is not None and self.parts != "human":
+            rgb, alpha = close_gaps(rgb, alpha, drawn.human.cpu().clamp(0, 1))
         solid = alpha[..., None]
         if self.transparent:
             # Over black the colour is multiplied with alpha already.

@@ -20,6 +20,7 @@ from evsplat.errors import DataError
 from evsplat.export.cloud import SplatCloud
 from evsplat.export.gaussians import cloud_at
 from evsplat.film import Look, load_motion_of
+from evsplat.film.gaps import close_gaps
 from evsplat.film.looks import depth_colours
 from evsplat.film.surroundings import CalmRoom
 from evsplat.methods.reconstruction import Parts
@@ -119,8 +120,8 @@ class ViewedRun:
             room = CalmRoom.of(recorded, self.track(motion.name).to("cpu"), recording)
             self._rooms[motion.name] = room
         shown = drawn.changed_by(room.clear, room.soften).render(camera, [time_us])
-        holes = 1 - shown.alpha[0].cpu().clamp(0, 1)[..., None]
-        picture = self.capture.shown(shown.rgb[0].cpu())
+        rgb, alpha = close_gaps(shown.rgb.cpu(), shown.alpha.cpu().clamp(0, 1), shown.human.cpu())
+        picture, holes = self.capture.shown(rgb[0]), 1 - alpha[0, ..., None]
         return (picture + holes * room.behind_coarsely(camera, time_us)).clamp(0, 1).numpy()
 
     def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
