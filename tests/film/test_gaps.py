@@ -1,9 +1,15 @@
 """Gaps of a solid scene have its colour, and where it ends nothing changes."""
 
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
 import pytest
 import torch
 
+from evsplat.film import Look
 from evsplat.film.gaps import close_gaps
+from evsplat.methods.reconstruction import Rendering
 
 COLOUR = torch.tensor([0.2, 0.5, 0.7])
 SIZES = [(96, 130), (300, 240)]
@@ -50,3 +56,17 @@ def test_nothing_of_the_person_goes_into_gaps_beside_them(rng):
     hues = closed[beside] / closed[beside].sum(-1, keepdim=True).clamp_min(1e-6)
     assert torch.allclose(hues, COLOUR / COLOUR.sum(), atol=1e-4)
     assert torch.equal(closed[human == 1], rgb[human == 1])
+
+
+@pytest.mark.parametrize("parts", ["all", "scene", "human"])
+def test_cut_out_scenes_are_opaque_and_as_bright_as_on_black(rng, parts):
+    """A scene lets through a tenth, for which its colours make up; a lone person's edge stays."""
+    rgb = torch.from_numpy(rng.uniform(0.2, 0.7, (1, 96, 96, 3))).float()
+    alpha = torch.full((1, 96, 96), 0.9)
+    drawn = Rendering(rgb, alpha, alpha if parts == "human" else torch.zeros_like(alpha))
+    reconstruction = SimpleNamespace(render=lambda *_, **__: drawn)
+    look = Look(parts=parts, transparent=True)
+    (found,) = look.expose(cast(Any, reconstruction), cast(Any, None), [0])
+    colour, opacity = (rgb / 0.9, 0.9) if parts == "human" else (rgb, 1.0)
+    assert np.abs(found[..., :3] - 255 * colour[0].numpy()).max() <= 0.51
+    assert np.abs(found[..., 3] - 255 * opacity).max() <= 0.51

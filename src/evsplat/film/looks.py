@@ -59,7 +59,7 @@ class Look:
         if self.shown == "events":
             coded = encode(luminance(decode(rgb, self.transfer)))
             return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
-        if self.surroundings is not None and self.parts != "human":
+        if (self.surroundings is not None or self.transparent) and self.parts != "human":
             rgb, alpha = close_gaps(rgb, alpha, drawn.human.cpu().clamp(0, 1))
         solid = alpha[..., None]
         if self.transparent:
