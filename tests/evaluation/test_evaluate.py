@@ -19,8 +19,9 @@ from evsplat.disk import held
 from evsplat.errors import ConfigError, DataError
 from evsplat.evaluation import evaluate
 from evsplat.evaluation import run as evaluation_run
-from evsplat.evaluation.event_maps import chosen_pairs
+from evsplat.evaluation.event_maps import chosen_pairs, evaluate_event_maps
 from evsplat.evaluation.protocols import METRICS, PSNR_CEILING_DB, REGIONS
+from evsplat.evaluation.regions import Absent
 from evsplat.evaluation.report.figures import figures
 from evsplat.evaluation.tables import write_tables
 from evsplat.methods.trivial import MedianBackground
@@ -217,6 +218,21 @@ def test_event_pairs_hold_every_test_frame_and_some_of_training_only(tiny_captur
     test = {frame.name for pair in pairs for frame in pair if frame.split == "test"}
     assert test == {frame.name for frame in capture.test_frames}
     assert sum(all(frame.split == "train" for frame in pair) for pair in pairs) == 3
+
+
+def test_of_one_frame_there_are_no_event_maps_and_the_reason_is_told(tiny_capture):
+    def drawn(*_):
+        raise AssertionError("there is nothing to draw")
+
+    path = edit(
+        tiny_capture(),
+        lambda document: document.update(
+            frames=[frame for frame in document["frames"] if frame["split"] == "train"][:1],
+            novel_views=[],
+        ),
+    )
+    found = evaluate_event_maps(load_capture(path), drawn, drawn)
+    assert isinstance(found, Absent) and "no camera has two" in found.reason
 
 
 def test_without_truth_the_figures_are_null_and_the_blurry_comparison_remains(

@@ -47,8 +47,9 @@ def lag(late_us: float) -> ClockEstimate:
     ],
 )
 def test_a_clock_that_is_late_is_learned_from_there(
-    tiny_capture, monkeypatch, choice, late_us, start_us
+    tiny_capture, monkeypatch, caplog, choice, late_us, start_us
 ):
+    caplog.set_level("INFO", "evsplat.methods.sensor")
     found = None if late_us is None else SensorEstimate(lag(late_us), None)
     monkeypatch.setattr(sensor, "estimate_sensor", lambda capture: found)
     learned = built("evsplat", tiny_capture(), f"clock={choice}", purpose="train").model.sensor
@@ -56,6 +57,10 @@ def test_a_clock_that_is_late_is_learned_from_there(
         assert learned.offset_us is None
     else:
         assert float(learned.offset_us) == pytest.approx(start_us)
+    said = [record.message for record in caplog.records if "clock is learned" in record.message]
+    way = "lag" if start_us and start_us > 0 else "lead"
+    told = f"events {way} the frames by 7.0 ms; the offset of their clock is learned"
+    assert said == ([told] if start_us else [])
 
 
 def forget(path) -> None:

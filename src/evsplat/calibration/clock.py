@@ -46,6 +46,11 @@ class ClockEstimate:
         """True where events and frames are surely not on one clock."""
         return abs(self.lag_us) > MOST_LAG_US and abs(self.lag_us) > 3 * self.spread_us
 
+    def __str__(self) -> str:
+        """What the events do, in words."""
+        way = "lag" if self.lag_us > 0 else "lead"
+        return f"events {way} the frames by {abs(self.lag_us) / 1000:.1f} ms"
+
 
 def estimate_clock(pairs: Sequence[FramePair], events: EventSource) -> ClockEstimate | None:
     """The lag at which what events add up to correlates best with the change between frames.

@@ -68,6 +68,8 @@ def _missing_input(capture: Capture) -> Absent | None:
         size = (capture.cameras[camera].width, capture.cameras[camera].height)
         if size != (capture.events.width, capture.events.height):
             return Absent(f"camera {camera!r} and the event sensor differ in resolution")
+    if not chosen_pairs(capture):
+        return Absent("they are of two frames of one camera, of which no camera has two")
     return None
 
 

@@ -25,7 +25,7 @@ def sensor_lines(
     if not unknown:
         doubt = f"+-{clock.spread_us / 1000:.1f} ms from part to part, and up to "
         doubt += f"{SLOW_MOTION_US / 1000:g} too late if all that moves is slow"
-    text = f"clock      events {_lag_text(clock)} ({doubt}; correlation {clock.correlation:.2f})"
+    text = f"clock      {clock} ({doubt}; correlation {clock.correlation:.2f})"
     if clock.differs:
         text += f"; clock_offset_us {_aligning_us(clock, clock_offset_us)} would align them"
     lines = [text]
@@ -35,12 +35,6 @@ def sensor_lines(
             f"({contrast.pixels:,} pixels, residual {contrast.residual:.2f})"
         )
     return lines
-
-
-def _lag_text(clock: ClockEstimate) -> str:
-    return (
-        f"{'lag' if clock.lag_us > 0 else 'lead'} the frames by {abs(clock.lag_us) / 1000:.1f} ms"
-    )
 
 
 def _aligning_us(clock: ClockEstimate, clock_offset_us: int) -> int:
@@ -56,7 +50,7 @@ def clock_findings(capture: Capture, estimate: SensorEstimate | None) -> list[Fi
     findings.warning(
         capture.path / "capture.json",
         "events.clock_offset_us",
-        f"{capture.clock_offset_us}, with which events {_lag_text(estimate.clock)}",
+        f"{capture.clock_offset_us}, with which {estimate.clock}",
         "events and frames on one clock",
         f"Write {aligning} there, or import again with --clock-offset-us {aligning}.",
     )

@@ -89,8 +89,7 @@ def _late_us(config: EvsplatConfig, estimate: SensorEstimate | None) -> float | 
         return None
     if estimate is None or not estimate.clock.differs:
         return 0.0 if config.clock == "always" else None
-    late_ms = estimate.clock.lag_us / 1000
-    logger.info("events lag the frames by %.1f ms; the offset of their clock is learned", late_ms)
+    logger.info("%s; the offset of their clock is learned", estimate.clock)
     return estimate.clock.lag_us
 
 
