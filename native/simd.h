@@ -38,9 +38,9 @@ INLINE void store_some(float* p, F v, size_t count) {
     __builtin_memcpy(p, &v, count * sizeof(float));
 }
 INLINE void store_ints(int32_t* p, I v) { __builtin_memcpy(p, &v, sizeof v); }
-// To an aligned place that is not read soon: past the cache, so that its line is not fetched first.
+// Into the second cache, for a read that comes later.
 INLINE void fetch(const float* p) { __builtin_prefetch(p, 0, 2); }
-
+// To an aligned place that is not read soon: past the cache, so that its line is not fetched first.
 INLINE void stream(float* p, F v) {
 #if defined(__AVX512F__) && EVSPLAT_LANES == 16
     _mm512_stream_ps(p, (__m512)v);

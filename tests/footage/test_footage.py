@@ -16,6 +16,8 @@ from evsplat.footage import open_footage
 from evsplat.untrusted.pictures import image_size
 from evsplat.untrusted.videos import opened_video
 
+from ..orientations import UPRIGHT
+
 
 def write_video(path: Path, pictures: np.ndarray, stamps: list[int], rate: int = 1000) -> None:
     """Lossless RGB (or 16-bit grey) video with the given times in units of 1 / rate seconds."""
@@ -96,19 +98,6 @@ def test_sixteen_bit_grey_video_keeps_its_depth(tmp_path):
     write_video(tmp_path / "deep.mkv", pictures, [0, 1, 2])
     read = [picture.pixels for picture in open_footage(tmp_path / "deep.mkv")]
     assert read[0].dtype == np.uint16 and np.array_equal(read, pictures)
-
-
-UPRIGHT = {
-    1: lambda stored: stored,
-    2: lambda stored: stored[:, ::-1],
-    3: lambda stored: stored[::-1, ::-1],
-    4: lambda stored: stored[::-1],
-    5: lambda stored: stored.swapaxes(0, 1),
-    6: lambda stored: np.rot90(stored, -1),
-    7: lambda stored: np.rot90(stored, 2).swapaxes(0, 1),
-    8: lambda stored: np.rot90(stored),
-}
-"""By the orientation of EXIF 2.32, table 6: where the stored first row and column are seen."""
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".jpg"])

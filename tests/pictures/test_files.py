@@ -12,6 +12,8 @@ from evsplat.errors import DataError
 from evsplat.pictures.files import holds_16_bits, read_image, to_unit_range
 from evsplat.untrusted.pictures import image_size
 
+from ..orientations import UPRIGHT
+
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("kind", ["u1", "u2"])
@@ -26,19 +28,6 @@ def test_a_tiff_keeps_its_depth_however_it_is_packed(
     assert read.dtype == pixels.dtype
     assert holds_16_bits(path) == (kind == "u2")
     assert np.array_equal(read.reshape(pixels.shape), pixels)
-
-
-UPRIGHT = {
-    1: lambda stored: stored,
-    2: lambda stored: stored[:, ::-1],
-    3: lambda stored: stored[::-1, ::-1],
-    4: lambda stored: stored[::-1],
-    5: lambda stored: stored.swapaxes(0, 1),
-    6: lambda stored: stored[::-1].swapaxes(0, 1),
-    7: lambda stored: stored[::-1, ::-1].swapaxes(0, 1),
-    8: lambda stored: stored[:, ::-1].swapaxes(0, 1),
-}
-"""By tag 274 of TIFF 6.0, which says where the stored first row and column are seen."""
 
 
 def write_bare_tiff(path: Path, pixels: np.ndarray, orientation: int) -> None:

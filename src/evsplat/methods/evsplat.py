@@ -211,7 +211,7 @@ def _priors(model: DiscModel) -> list[Objective]:
 def _filled(
     model: DiscModel, capture: TrainingCapture, config: EvsplatConfig, seen: Seen
 ) -> dict[str, Tensor]:
-    """What the end of training decides of the person, and around the pictures of one camera."""
+    """What the end of training decides of the person, and of the scene that one camera saw."""
     decided = filled(model, capture, config.fill, seen)
     frames = capture.train_frames
     several = len({frame.camera for frame in frames}) > 1

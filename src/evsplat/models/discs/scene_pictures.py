@@ -1,6 +1,7 @@
 """Pictures of the scene alone, as linear functions of its colours."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial, reduce
 from operator import add
 
@@ -45,7 +46,8 @@ class ScenePictures:
 
     def draw(self, values: Float[Tensor, "1 S C"], view: Camera) -> Float[Tensor, "1 H W C"]:
         """A picture with these in place of colours."""
-        return render(fixed(self._scene, values), view, low_pass=self._low_pass).image
+        scene = replace(self._scene, channels=values)
+        return render(scene, view, low_pass=self._low_pass).image
 
     def twice(self, values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
         """``J^T J values``."""
