@@ -89,9 +89,10 @@ class _Clock:
     def render(self, camera, times_us, *, parts="all"):
         levels = torch.tensor([time / 1000 / 255 for time in times_us])
         rgb = levels[:, None, None, None].expand(-1, camera.height, camera.width, 3)
+        human = torch.zeros_like(rgb[..., 0])
         if parts == "human":
-            rgb = rgb * 0
-        return Rendering(rgb, rgb[..., 0], rgb[..., 0])
+            return Rendering(rgb * 0, human, human)
+        return Rendering(rgb, human + 1, human)
 
 
 @pytest.fixture
