@@ -28,8 +28,11 @@ def evaluate_event_maps(
     absent = _missing_input(capture)
     if absent is not None:
         return absent
+    chosen = chosen_pairs(capture)
+    if not chosen:
+        return Absent("they are of two frames of one camera, of which no camera has two")
     pairs: list[dict[str, Any]] = []
-    for before, after in chosen_pairs(capture):
+    for before, after in chosen:
         given, rendered = _maps(capture, frames, before, after)
         stem = file_stem("events", before.name, after.name)
         # The brightest percent would make the rest invisible; both maps get the same scale.
@@ -68,8 +71,6 @@ def _missing_input(capture: Capture) -> Absent | None:
         size = (capture.cameras[camera].width, capture.cameras[camera].height)
         if size != (capture.events.width, capture.events.height):
             return Absent(f"camera {camera!r} and the event sensor differ in resolution")
-    if not chosen_pairs(capture):
-        return Absent("they are of two frames of one camera, of which no camera has two")
     return None
 
 

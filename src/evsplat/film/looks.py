@@ -55,12 +55,13 @@ class Look:
             depth = reconstruction.depth(camera, times_us, parts=self.parts)
             return list((depth * 1000).round().clamp(0, 65_535).numpy().astype(np.uint16))
         drawn = reconstruction.render(camera, times_us, parts=self.parts)
-        rgb, alpha = drawn.rgb.cpu().clamp(0, 1), drawn.alpha.cpu().clamp(0, 1)
+        values = (drawn.rgb, drawn.alpha, drawn.human)
+        rgb, alpha, human = (value.cpu().clamp(0, 1) for value in values)
         if self.shown == "events":
             coded = encode(luminance(decode(rgb, self.transfer)))
             return list((coded * 65_535).round().clamp(0, 65_535).numpy().astype(np.uint16))
         if (self.surroundings is not None or self.transparent) and self.parts != "human":
-            rgb, alpha = close_gaps(rgb, alpha, drawn.human.cpu().clamp(0, 1))
+            rgb, alpha = close_gaps(rgb, alpha, human)
         solid = alpha[..., None]
         if self.transparent:
             # Over black the colour is multiplied with alpha already.
@@ -71,8 +72,8 @@ class Look:
             rooms = [self.surroundings.behind(camera, time) for time in times_us]
             rgb = (rgb + (1 - solid) * torch.stack(rooms)).clamp(0, 1)
         if self.shown == "semantic":
-            human = drawn.human.cpu().clamp(0, 1)[..., None]
-            tint = human * torch.tensor(_HUMAN) + (1 - human) * torch.tensor(_SCENE)
+            share = human[..., None]
+            tint = share * torch.tensor(_HUMAN) + (1 - share) * torch.tensor(_SCENE)
             grey = rgb.mean(-1, keepdim=True)
             rgb = (0.3 * solid + 0.7 * grey) * tint
         if self.shown == "certainty":

@@ -197,7 +197,7 @@ class _Upright:
                 upright = self._front_and_seat(strip, below, wall, breaks[:, at])
                 leaning = below + (wall - below) * np.linspace(_LEADS_BACK, 0, foot - top + 1)
                 thing = (upright + leaning) / 2
-                shares[top : foot + 1, at] = np.minimum(nearest[top : foot + 1, at] / thing, 1)
+                shares[strip, at] = np.minimum(nearest[strip, at] / thing, 1)
         return torch.from_numpy(shares[self.places]).float()
 
     def _front_and_seat(

@@ -5,8 +5,6 @@ small gradients as far as any, makes a rainbow of them that cameras beside the r
 """
 
 from collections.abc import Sequence
-from functools import reduce
-from operator import add
 
 import torch
 from jaxtyping import Float
@@ -14,9 +12,7 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
-from evsplat.gaussians.surface_graph import closest
 from evsplat.gaussians.surround import cell_px, continued
-from evsplat.models.discs.first_colours import LEAST, MOST
 from evsplat.models.discs.scene_pictures import ScenePictures
 from evsplat.neighbours import nearest
 
@@ -29,7 +25,6 @@ PRICE = 1 / 800
 _BEYOND, _RIM = 0.25, 2.0
 """Cells beyond a border from which on a Gaussian is outside, and up to which from the border inside
 colours may make up for what is missed of those."""
-_FAST = 1e6
 _HIDDEN, _SEEN, _AROUND = 0.02, 0.1, 16
 """Squared shares of pixels below which a Gaussian within a picture is hidden, and from which it is
 seen; and of how many that are seen a hidden one has the mean colour."""
@@ -63,16 +58,11 @@ def outskirts(
         rows = outside & (closest_view == index)
         places = view.project(pictures.means)[0]
         told[rows] = continued(picture[0].cpu(), places[rows].cpu(), cell).to(own.device)
-    squares = reduce(add, pictures.squares())
-    shown = ~outside & (squares > _SEEN)
+    shown = ~outside & (pictures.squares > _SEEN)
     # What one of several views hides another may show.
     if len(views) == 1 and shown.sum() >= _AROUND:
-        hidden = ~near & (squares < _HIDDEN) & pictures.behind(views[0])
+        hidden = ~near & (pictures.squares < _HIDDEN) & pictures.behind(views[0])
         _, around = nearest(pictures.means[shown], _AROUND, pictures.means[hidden])
         told[hidden] = own[shown][around].mean(1)
         near = near | hidden
-    missing = pictures.missing(told)
-    price = torch.where(near, PRICE * cell**2, _FAST).to(own)
-    none = torch.zeros_like(price)
-    found = closest(told, missing, pictures.twice, squares, price, none, STEPS)
-    return torch.where(near[:, None], found.clamp(LEAST, MOST), own)
+    return pictures.near(told, near, PRICE * cell**2, STEPS)

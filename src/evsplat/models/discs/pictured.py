@@ -12,15 +12,12 @@ from torch.nn import functional as F
 
 from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
-from evsplat.gaussians.surface_graph import closest
-from evsplat.models.discs.first_colours import LEAST, MOST
 from evsplat.models.discs.scene_pictures import ScenePictures
 
 STEPS = 30
 """Of conjugate gradients."""
 PRICE = 1 / 2000
 """What a squared difference to the picture's colour costs, in pixels."""
-_FAST = 1e6
 
 
 def pictured(gaussians: GaussianSet, recorded: Camera, low_pass: float) -> Float[Tensor, "S 3"]:
@@ -34,12 +31,7 @@ def pictured(gaussians: GaussianSet, recorded: Camera, low_pass: float) -> Float
     own = pictures.colours
     within = (pictures.cells_beyond(recorded) < 0) & ~pictures.behind(recorded)
     told = torch.where(within[:, None], _colours_at(pictures, recorded), own)
-    price = torch.where(within, PRICE, _FAST).to(own)
-    none = torch.zeros_like(price)
-    (squares,) = pictures.squares()
-    missing = pictures.missing(told)
-    found = closest(told, missing, pictures.twice, squares, price, none, STEPS, own)
-    return torch.where(within[:, None], found.clamp(LEAST, MOST), own)
+    return pictures.near(told, within, PRICE, STEPS, own)
 
 
 def _colours_at(pictures: ScenePictures, view: Camera) -> Float[Tensor, "S 3"]:

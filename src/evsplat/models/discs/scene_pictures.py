@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from operator import add
 
 import torch
@@ -11,11 +11,14 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
+from evsplat.gaussians.surface_graph import closest
 from evsplat.gaussians.surround import cell_px
+from evsplat.models.discs.first_colours import LEAST, MOST
 from evsplat.models.discs.still import Still
 from evsplat.models.seen import fixed, shares_by, transposed
 from evsplat.render import render
 
+_FAST = 1e6
 _FARTHER = 1.15
 """Least depth of what is hidden as a share of the picture's there."""
 
@@ -49,22 +52,34 @@ class ScenePictures:
         scene = replace(self._scene, channels=values)
         return render(scene, view, low_pass=self._low_pass).image
 
-    def twice(self, values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
-        """``J^T J values``."""
-        return self._over(values, lambda drawn, _: drawn)
-
-    def missing(self, values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
-        """``J^T`` of what the pictures of these colours lack of those before."""
-        return self._over(values, lambda drawn, index: self.before[index] - drawn)
-
-    def squares(self) -> list[Float[Tensor, " S"]]:
-        """Of each view, the sums of the squared shares; estimates without bias."""
+    @cached_property
+    def squares(self) -> Float[Tensor, " S"]:
+        """Sums of the squared shares of all pixels; estimates without bias."""
         generator = torch.Generator().manual_seed(0)
         shares = [
             shares_by(partial(self.draw, view=view), self.means[None], generator)
             for view in self.views
         ]
-        return [each[:, 1:].square().mean(1) for each in shares]
+        return reduce(add, [each[:, 1:].square().mean(1) for each in shares])
+
+    def near(
+        self,
+        told: Float[Tensor, "S 3"],
+        free: Bool[Tensor, " S"],
+        price: float,
+        steps: int,
+        start: Float[Tensor, "S 3"] | None = None,
+    ) -> Float[Tensor, "S 3"]:
+        """Colours near to those ``told`` with which the pictures look as before (`closest`).
+
+        The others than the ``free`` ones stay. ``price``: what a squared difference to those told
+        costs, in pixels.
+        """
+        missing = self._over(told, lambda drawn, index: self.before[index] - drawn)
+        prices = torch.where(free, price, _FAST).to(told)
+        none = torch.zeros_like(prices)
+        found = closest(told, missing, self._twice, self.squares, prices, none, steps, start)
+        return torch.where(free[:, None], found.clamp(LEAST, MOST), self.colours)
 
     def cells_beyond(self, view: Camera) -> Float[Tensor, " S"]:
         """Cells of the surround from a picture's border to what is outside; negative within."""
@@ -82,6 +97,10 @@ class ScenePictures:
             sums = self.draw(values, view)[0]
         depths, shares = sums[y, x].unbind(-1)
         return inside & (depth * shares > _FARTHER * depths)
+
+    def _twice(self, values: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
+        """``J^T J values``."""
+        return self._over(values, lambda drawn, _: drawn)
 
     def _over(
         self, values: Float[Tensor, "S 3"], weights: Callable[[Tensor, int], Tensor]
