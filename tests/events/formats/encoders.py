@@ -214,6 +214,12 @@ _XML = """<dv version="2.0"><node name="outInfo" path="/mainloop/Recorder/outInf
 <node name="2"><attr key="typeIdentifier" type="string">IMUS</attr></node></node></dv>"""
 
 
+def aedat4_events(s: EventStream) -> bytes:
+    """What a packet of events holds."""
+    data = b"".join(struct.pack("<qhh?3x", t, x, y, bool(on)) for t, x, y, on in rows(s))
+    return flatbuffer({}, {0: (len(s), data)}, b"EVTS")
+
+
 def aedat4(
     s: EventStream,
     width: int,
@@ -223,9 +229,10 @@ def aedat4(
     compression: int = 1,
     packet: int = 700,
     table_at: int = -1,
+    description: str = _XML,
 ) -> bytes:
     """Packets of events with one of IMU between, then frames (image, start, end of exposure)."""
-    xml = _XML.format(w=width, h=height).encode()
+    xml = description.format(w=width, h=height).encode()
     header = flatbuffer(
         {0: struct.pack("<i", compression), 1: struct.pack("<q", table_at)},
         {2: (len(xml), xml)},
@@ -243,11 +250,8 @@ def aedat4(
             payload = zstandard.ZstdCompressor().compress(payload)
         out += struct.pack("<ii", stream, len(payload)) + payload
 
-    events = rows(s)
-    for first in range(0, len(events), packet):
-        part = events[first : first + packet]
-        data = b"".join(struct.pack("<qhh?3x", t, x, y, bool(on)) for t, x, y, on in part)
-        add(0, flatbuffer({}, {0: (len(part), data)}, b"EVTS"))
+    for first in range(0, len(s), packet):
+        add(0, aedat4_events(s.take(slice(first, first + packet))))
         add(2, b"whatever an IMU says")
     for image, start, end in frames:
         kind = {2: 0, 3: 16}[image.ndim]

@@ -1,6 +1,7 @@
 """Binary formats against encoders written from their descriptions."""
 
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -131,6 +132,57 @@ def test_frames_come_with_their_exposure(tmp_path: Path, compression: int) -> No
     assert [frame.exposure_us for frame in read] == [(1_000, 9_000), (40_000, 55_000)]
     assert np.array_equal(read[0].image, grey) and np.array_equal(read[1].image, colour)
     assert same(recording.read(), s)
+
+
+def test_a_frame_with_a_time_and_a_length_alone_is_exposed_from_that_time_on(
+    tmp_path: Path,
+) -> None:
+    """As dv-processing 1.7.9 and 2.0.4 read it; both write start and end as well."""
+    fields = {
+        0: struct.pack("<q", 5_000),
+        5: b"\0",
+        6: struct.pack("<h", 8),
+        7: struct.pack("<h", 6),
+        11: struct.pack("<q", 20_000),
+    }
+    frame = encoders.flatbuffer(fields, {10: (48, bytes(range(48)))}, b"FRME")
+    data = encoders.aedat4(random_stream(12, 50), WIDTH, HEIGHT, compression=0)
+    path = tmp_path / "e.aedat4"
+    path.write_bytes(data + struct.pack("<ii", 1, len(frame)) + frame)
+    assert [read.exposure_us for read in open_recording(path).frames()] == [(5_000, 25_000)]
+
+
+def _described(*streams: tuple[str, str]) -> str:
+    """The header's list of streams, of a kind and of a camera each."""
+    nodes = (
+        f'<node name="{number}"><attr key="typeIdentifier">{kind}</attr><node name="info">'
+        '<attr key="sizeX">{w}</attr><attr key="sizeY">{h}</attr>'
+        f'<attr key="source">{camera}</attr></node></node>'
+        for number, (kind, camera) in enumerate(streams)
+    )
+    return f'<dv><node name="outInfo">{"".join(nodes)}</node></dv>'
+
+
+def test_of_two_cameras_in_aedat4_events_and_frames_are_of_one(tmp_path: Path) -> None:
+    """Frames of the right camera came with events of the left one, which has none."""
+    left, right = random_stream(31, 80), random_stream(32, 60)
+    picture = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    cameras = [("EVTS", "DVX"), ("FRME", "DAVIS"), ("IMUS", "DVX"), ("EVTS", "DAVIS")]
+    data = encoders.aedat4(
+        left,
+        WIDTH,
+        HEIGHT,
+        [(picture, 100, 900)],
+        compression=0,
+        description=_described(*cameras),
+    )
+    events = encoders.aedat4_events(right)
+    path = tmp_path / "stereo.aedat4"
+    path.write_bytes(data + struct.pack("<ii", 3, len(events)) + events)
+    recording = open_recording(path)
+    assert same(recording.read(), right)
+    assert [frame.exposure_us for frame in recording.frames()] == [(100, 900)]
+    assert recording.notes == ["EVTS streams [0, 3]: only stream 3 is read"]
 
 
 AEDAT3_FRAMES = [

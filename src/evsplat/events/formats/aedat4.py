@@ -9,6 +9,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import lz4.frame
@@ -41,8 +42,19 @@ _EVENT = np.dtype(
 # OpenCV's type numbers -> channels
 _PICTURE_CHANNELS = {0: 1, 16: 3, 24: 4}
 
-# stream -> type, width, height
-_Streams = dict[int, tuple[str, int | None, int | None]]
+
+class _Stream(NamedTuple):
+    """What the header tells of a stream."""
+
+    kind: str
+    """EVTS, FRME, ..."""
+    source: str
+    """Name of the camera; empty where the file does not say."""
+    width: int | None
+    height: int | None
+
+
+_Streams = dict[int, _Stream]
 
 
 class Aedat4(Source):
@@ -57,11 +69,13 @@ class Aedat4(Source):
             self._refuse_another(self._end)
         self._decompress = _decompressor(self.path, compression)
         streams = self._streams(description)
-        self._events = self._choose(streams, "EVTS")
-        self._frames = self._choose(streams, "FRME")
+        framed = {stream.source for stream in streams.values() if stream.kind == "FRME"}
+        self._events = self._choose(streams, "EVTS", framed)
         if self._events is None:
             raise DataError(f"{self.path}: holds no event stream (found {_names(streams)}).")
-        self.width, self.height = streams[self._events][1:]
+        of_events = streams[self._events]
+        self.width, self.height = of_events.width, of_events.height
+        self._frames = self._choose(streams, "FRME", {of_events.source})
 
     def blocks(self) -> Iterator[RawEvents]:
         """Packets of the event stream."""
@@ -118,18 +132,22 @@ class Aedat4(Source):
                 values = {attr.get("key"): attr.text or "" for attr in node.iter("attr")}
                 size = [int(values[key]) if key in values else None for key in ("sizeX", "sizeY")]
                 kind = values.get("typeIdentifier", "")
-                streams[int(node.get("name", ""))] = (kind, size[0], size[1])
+                source = values.get("source", "")
+                streams[int(node.get("name", ""))] = _Stream(kind, source, size[0], size[1])
             return streams
         except (ElementTree.ParseError, ValueError) as error:
             raise DataError(
                 f"{self.path}: the list of streams in its AEDAT4 header is damaged ({error})."
             ) from None
 
-    def _choose(self, streams: _Streams, kind: str) -> int | None:
-        found = sorted(number for number, (name, _, _) in streams.items() if name == kind)
+    def _choose(self, streams: _Streams, kind: str, cameras: set[str]) -> int | None:
+        """The first stream of a kind, of ``cameras`` where they have one."""
+        found = sorted(number for number, stream in streams.items() if stream.kind == kind)
+        own = [number for number in found if streams[number].source in cameras]
+        chosen = next(iter(own or found), None)
         if len(found) > 1:
-            self.notes.append(f"{kind} streams {found}: only stream {found[0]} is read")
-        return found[0] if found else None
+            self.notes.append(f"{kind} streams {found}: only stream {chosen} is read")
+        return chosen
 
     def _packets(self, stream: int | None, identifier: bytes) -> Iterator[tuple[int, bytes]]:
         """Offset and decompressed, size-prefixed buffer of each packet of a stream."""
@@ -173,11 +191,11 @@ class Aedat4(Source):
 
 
 def _frame(table: "_Table") -> RecordedFrame:
-    start, end, timestamp = table.integer(3, "q"), table.integer(4, "q"), table.integer(0, "q")
+    start, end = table.integer(3, "q"), table.integer(4, "q")
     if not start and not end:
-        # dv-processing writes the middle of the exposure and its length instead
-        exposure = table.integer(11, "q")
-        start, end = timestamp - exposure // 2, timestamp - exposure // 2 + exposure
+        # dv-processing reads such a frame as well: its time is the start of its exposure
+        start = table.integer(0, "q")
+        end = start + table.integer(11, "q")
     kind, width, height = table.integer(5, "b"), table.integer(6, "h"), table.integer(7, "h")
     pixels = np.frombuffer(table.vector(10, 1), dtype=np.uint8)
     channels = _PICTURE_CHANNELS.get(kind)
@@ -195,7 +213,7 @@ def _frame(table: "_Table") -> RecordedFrame:
 
 
 def _names(streams: _Streams) -> str:
-    return ", ".join(sorted({kind for kind, _, _ in streams.values()})) or "none"
+    return ", ".join(sorted({stream.kind for stream in streams.values()})) or "none"
 
 
 def _decompressor(path: Path, compression: int) -> Callable[[bytes], bytes]:
