@@ -293,6 +293,30 @@ def _packets(store, s: EventStream):
         )
 
 
+def test_a_packet_that_was_lost_is_told_and_makes_no_event_of_another_row_or_time(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """The words behind it have rows and bits of the time from those before it."""
+    s = random_stream(int(rng.integers(1 << 31)), 3_000, gap_us=700)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(PACKET_MSG, "event_camera_msgs/msg/EventPacket"))
+    kind = "event_camera_msgs/msg/EventPacket"
+    packets = list(_packets(store, s))
+    lost = {1, 2, int(rng.integers(4, len(packets) - 1))}
+    with FolderWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/camera/events", kind, typestore=store)
+        for number, message in enumerate(packets):
+            if number not in lost:
+                bag.write(topic, number + 1, store.serialize_cdr(message, kind))
+    recording = open_recording(tmp_path / "bag")
+    read, sent = encoders.rows(recording.read()), encoders.rows(s)
+    assert set(read) <= set(sent)
+    # four words of an event at most; a packet more, until row and time are told again
+    assert len(sent) - len(read) <= len(lost) * (502 // 2 + 20)
+    (note,) = recording.notes
+    assert note.startswith("warning: by their numbers 3 packets of /camera/events did not arrive")
+
+
 def test_a_damaged_message_is_an_error_or_left_out(tmp_path: Path) -> None:
     s = random_stream(25, 340)
     store = get_typestore(Stores.ROS1_NOETIC)

@@ -8,7 +8,7 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from evsplat.errors import DataError
 from evsplat.events.formats.base import RawEvents, Source, parts_said, peek
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
+from evsplat.wording import counted
 
 ROS1_MAGIC = b"#ROSBAG V2.0"
 _ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
@@ -28,6 +29,8 @@ _TIME_AND_POLARITY = [("seconds", "<u4"), ("nanoseconds", "<u4"), ("p", "u1")]
 _LOOP_US, _RENUMBERED = (1 << 24) // 2, 100
 """Half the loop of EVT 3's counter, the longest time in which it is known how often it went round;
 and by how much the numbers of packets fall where they begin anew, and not where some came late."""
+_TELL = 0x0, 0x6, 0x8
+"""Words of EVT 3 that tell row, low and high bits of the time of the events behind them."""
 _ROS1_EVENT = np.dtype([*_PIXEL, *_TIME_AND_POLARITY])
 # ROS 2 aligns each number, not each event: all events but the first begin two bytes after a
 # multiple of four, so that two bytes of padding come before their time and one after them.
@@ -60,6 +63,7 @@ class RosBag(Source):
     def blocks(self) -> Iterator[RawEvents]:
         """One message at a time."""
         decoder, count = WordDecoder(_ENCODING, self.damage), 0
+        lost, is_known = 0, True
         before: _Message | None = None
         with _opened(self.path) as bag:
             for number, message in self._messages(bag):
@@ -77,7 +81,15 @@ class RosBag(Source):
                             "pictures."
                         )
                     decoder = WordDecoder(_ENCODING, self.damage)
+                elif before is not None and message.packet > before.packet + 1:
+                    lost, is_known = lost + message.packet - before.packet - 1, False
+                    self.damage.warnings["lost"] = (
+                        f"by their numbers {counted(lost, 'packet')} of {self._topic} did not "
+                        "arrive, nor did their events; record anew what needs them"
+                    )
                 before = message
+                if not is_known:
+                    message, is_known = _known_again(message)
                 for events in self._packet(decoder, message, number):
                     count += len(events.t)
                     yield events
@@ -123,6 +135,20 @@ class _Message:
     """When the driver sent it, by ROS's clock."""
     packet: int
     """Number of a packet, by its driver; 0 of an array."""
+
+
+def _known_again(message: _Message) -> tuple[_Message, bool]:
+    """A packet behind a lost one, without events whose time or row went with that one.
+
+    False where its words do not tell all of that, so that the next one is to be looked at as well.
+    """
+    words = np.frombuffer(message.events, "<u2", len(message.events) // 2)
+    kinds = words >> 12
+    firsts = [np.flatnonzero(kinds == kind) for kind in _TELL]
+    is_known = all(len(first) for first in firsts)
+    from_here = max(int(first[0]) for first in firsts) if is_known else len(words)
+    kept = words[np.isin(kinds, _TELL) | (np.arange(len(words)) > from_here)]
+    return replace(message, events=kept.tobytes()), is_known
 
 
 def _begins_anew(before: _Message, after: _Message) -> str | None:
