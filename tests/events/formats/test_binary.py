@@ -112,6 +112,15 @@ def test_an_address_that_begins_like_a_comment_is_an_event(
     assert same(read_events(tmp_path / "e.aedat"), s)
 
 
+def test_dat_of_the_first_version_is_refused(tmp_path: Path) -> None:
+    """Its columns have 9 bits and its rows 8: they were read as columns far to the right."""
+    header = b"% Data file containing CD events.\n% Version 1\n"
+    pixel = 1 << 17 | 100 << 9 | 200
+    (tmp_path / "e.dat").write_bytes(header + b"\0\x08" + struct.pack("<II", 5, pixel))
+    with pytest.raises(DataError, match="says version 1 of DAT.*expected version 2"):
+        open_recording(tmp_path / "e.dat")
+
+
 def test_dvs128_has_the_polarity_of_jaer(tmp_path: Path) -> None:
     s = random_stream(11, 100)
     s = EventStream(s.t, s.x % 128, s.y % 128, s.p)

@@ -24,6 +24,7 @@ _EVT21_TYPES = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
 # Lines of which every header has one; so many bytes are no events by chance.
 _ANOTHER_RAW = re.compile(rb"% (?:evt [23]|format EVT)")
 _ANOTHER_DAT = re.compile(rb"% (?:Data file containing|Version [12])")
+_DAT_VERSION = "2"
 _DAT_EVENT = np.dtype([("t", "<u4"), ("pixel", "<u4")])
 _DAT_EVENT_TYPES = (0x00, 0x0C)
 _DAT_READ_EVENTS = 1 << 17
@@ -140,6 +141,12 @@ class Dat(Source):
             raise DataError(
                 f"{self.path}: after its header come bytes {kind.hex(' ') or 'none'}, expected an "
                 "event type of 0 or 12 and a size of 8."
+            )
+        version = header.values.get("version", _DAT_VERSION)
+        if version != _DAT_VERSION:
+            raise DataError(
+                f"{self.path}: its header says version {version} of DAT, whose pixels are laid out "
+                f"otherwise, expected version {_DAT_VERSION}; write the recording anew."
             )
         self.width, self.height = header.width, header.height
 
