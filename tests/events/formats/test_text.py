@@ -41,6 +41,35 @@ def test_headers_orders_and_units_give_the_same_events(tmp_path: Path) -> None:
         assert same(read_events(packed), s)
 
 
+@pytest.mark.parametrize("header", [",t,x,y,p\n", ",timestamp,x,y,polarity\n"])
+def test_the_numbers_of_rows_that_pandas_writes_are_passed_over(
+    tmp_path: Path, header: str
+) -> None:
+    """Without a name for the first column, five columns were read as MMHPSD's."""
+    s = random_stream(6, 300)
+    path = tmp_path / "e.csv"
+    path.write_text(header + _lines(np.arange(len(s)), s.t, s.x, s.y, s.p, sep=","))
+    assert same(read_events(path), s)
+
+
+@pytest.mark.parametrize("zero", ["0", "0.0"])
+def test_seconds_that_are_whole_at_first_are_not_taken_for_microseconds_silently(
+    tmp_path: Path, zero: str
+) -> None:
+    """As of a simulator that begins with thousands of events at once."""
+    s = random_stream(7, 2_500, gap_us=700)
+    path = tmp_path / "e.txt"
+    t = np.concatenate([np.zeros(2_500, np.int64), s.t])
+    times = [zero] * 2_500 + [f"{value:.6f}" for value in s.t * 1e-6]
+    rows = zip(times, *(np.tile(v, 2).tolist() for v in (s.x, s.y, s.p)), strict=True)
+    path.write_text("".join(" ".join(map(str, row)) + "\n" for row in rows))
+    recording = open_recording(path)
+    recording.read()
+    assert "5,000 events come within 1 us, more than any sensor sends" in recording.notes[-1]
+    told = open_recording(path, time_unit="s")
+    assert np.array_equal(told.read().t, t) and "sensor sends" not in told.notes[-1]
+
+
 def test_another_size_of_mmhpsds_columns_is_refused(tmp_path: Path) -> None:
     """Told 1280x800, the sensor before it was turned, most rows lay beside it."""
     path = tmp_path / "event0000.csv"

@@ -18,6 +18,8 @@ _MAX_TIME_US = 1 << 60
 _LONGEST_US = 24 * 3600 * 1_000_000
 _SILENCE_US = 10_000_000
 """Longer times without an event are remarked: sensors have noise, where no filter takes it."""
+_MOST_PER_US, _MANY = 1_000, 1_000
+"""More events in a microsecond than any sensor sends, and of how many that is asked."""
 
 
 def checked(
@@ -43,12 +45,16 @@ def checked(
 
 
 def _within_a_day(streams: Iterable[EventStream], damage: Damage) -> Iterator[EventStream]:
-    """The streams; a `DataError` where one wild time would make an index of years."""
+    """The streams; a `DataError` where one wild time would make an index of years.
+
+    The other way round, seconds that were read as microseconds are remarked.
+    """
     first_us: int | None = None
+    last_us, count = 0, 0
     for stream in streams:
         if len(stream):
             first_us = int(stream.t[0]) if first_us is None else first_us
-            last_us = int(stream.t[-1])
+            last_us, count = int(stream.t[-1]), count + len(stream)
             if last_us - first_us > _LONGEST_US:
                 raise DataError(
                     f"{damage.path}: has events from {first_us} to {last_us} us, expected a "
@@ -56,6 +62,11 @@ def _within_a_day(streams: Iterable[EventStream], damage: Damage) -> Iterator[Ev
                     f"of a table with {SAY_UNIT}."
                 )
         yield stream
+    if first_us is not None and count > max(_MANY, _MOST_PER_US * (last_us - first_us)):
+        damage.warnings["rate"] = (
+            f"{count:,} events come within {last_us - first_us:,} us, more than any sensor sends; "
+            f"give the unit of their times with {SAY_UNIT}"
+        )
 
 
 class _Settled:

@@ -16,7 +16,8 @@ MAX_LINE_BYTES = 4096
 _MAX_HEADER_LINES = 100
 _SAMPLE_LINES = 2000
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-_NAME = re.compile(rb"[\w@ .()\[\]/-]+")
+# empty: that of the numbers of rows, as pandas writes them
+_NAME = re.compile(rb"[\w@ .()\[\]/-]*")
 _DELIMITERS = (b",", b";")
 
 
@@ -64,7 +65,7 @@ def inspect_text(path: Path) -> TextFile:
             line = raw.strip()
             delimiter = next((d for d in _DELIMITERS if d in line), b"")
             fields = _split(line.lstrip(b"#% "), delimiter)
-            if not fields or not fields[0]:
+            if not any(fields):
                 continue
             is_comment = line[:1] in (b"#", b"%")
             header.append(line)
