@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Frame, TrainingCapture
-from evsplat.restore.network import NetworkRestorer, SupervisedAttention, as_input
+from evsplat.restore.network import NetworkRestorer, SupervisedAttention
 from evsplat.weights import WeightFile, fill, state_under
 
 LEVELS = (96, 144, 192)
@@ -43,10 +42,6 @@ class MprNet(NetworkRestorer):
     def load(self, path: Path) -> nn.Module:
         """The network for deblurring."""
         return fill(ThreeStages(), state_under(path, ("state_dict",)), path, what=self.file.name)
-
-    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
-        """The blurry picture."""
-        return [as_input(capture.image(frame))]
 
 
 class ThreeStages(nn.Module):

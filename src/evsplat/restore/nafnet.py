@@ -16,9 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from evsplat.capture import Frame, TrainingCapture
 from evsplat.errors import WeightsError
-from evsplat.restore.network import NetworkRestorer, as_input
+from evsplat.restore.network import NetworkRestorer
 from evsplat.weights import WeightFile, fill, state_under
 
 AVERAGED_PX = 384
@@ -52,10 +51,6 @@ class NafNet(NetworkRestorer):
         down = [_count(state, rf"encoders\.{level}\.(\d+)\.") for level in range(levels)]
         up = [_count(state, rf"decoders\.{level}\.(\d+)\.") for level in range(levels)]
         return fill(NafUNet(width, down, middle, up), state, path, what=what)
-
-    def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
-        """The blurry picture."""
-        return [as_input(capture.image(frame))]
 
 
 class NafUNet(nn.Module):

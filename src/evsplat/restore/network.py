@@ -66,9 +66,9 @@ class NetworkRestorer(Pretrained):
     multiple: ClassVar[int]
     """The network wants sides that are a multiple of this."""
 
-    @abstractmethod
     def inputs(self, capture: TrainingCapture, frame: Frame) -> Sequence[Float[Tensor, "1 _ H W"]]:
-        """Inputs of the network for a frame."""
+        """Inputs of the network for a frame: the blurry picture, where it takes nothing else."""
+        return [as_input(capture.image(frame))]
 
     def restore(
         self, capture: TrainingCapture, frames: Sequence[Frame]
