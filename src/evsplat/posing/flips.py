@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from evsplat.body.rotations import nearest_axis_angle
-from evsplat.posing.kinematics import pose, row_slice
+from evsplat.posing.kinematics import cross_matrix, pose, row_slice
 from evsplat.posing.problem import Problem, State, descend
 
 _BONES = {
@@ -153,9 +153,7 @@ def _smallest_turns(
     a = torch.nn.functional.normalize(start, dim=-1)
     b = torch.nn.functional.normalize(end, dim=-1)
     cross, cosine = torch.linalg.cross(a, b), (a * b).sum(-1)
-    zero = torch.zeros_like(cosine)
-    x, y, z = cross.unbind(-1)
-    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    skew = cross_matrix(cross)
     # Opposite directions have no smallest turn; any near one does, and the fit goes on from there.
     share = 1 / (1 + cosine).clamp_min(1e-2)
     turn = torch.eye(3, dtype=start.dtype) + skew + share[:, None, None] * skew @ skew

@@ -118,7 +118,7 @@ def left_jacobian(vectors: Float[Tensor, "*T 3"]) -> Float[Tensor, "*T 3 3"]:
     angle = safe.sqrt()
     first = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
     second = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
-    cross = _cross_matrix(vectors)
+    cross = cross_matrix(vectors)
     eye = torch.eye(3, dtype=vectors.dtype)
     return eye + first * cross + second * cross @ cross
 
@@ -137,7 +137,8 @@ def six_rates(six: Float[Tensor, "T 6"]) -> Float[Tensor, "T 3 6"]:
     return torch.cat((by_a, by_b), 2)
 
 
-def _cross_matrix(vectors: Float[Tensor, "*T 3"]) -> Float[Tensor, "*T 3 3"]:
+def cross_matrix(vectors: Float[Tensor, "*T 3"]) -> Float[Tensor, "*T 3 3"]:
+    """Matrices whose products are the cross products with ``vectors`` at their left."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))

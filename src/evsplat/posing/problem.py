@@ -10,7 +10,6 @@ of the same matrix is the covariance of what was found.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -21,7 +20,6 @@ from evsplat.posing.kinematics import PLACE, SIX, SIZE, TURNS, Posed, pose, row_
 from evsplat.posing.prior import HINGES, PosePrior
 from evsplat.posing.rig import Rig
 from evsplat.posing.splines import NormalEquations, UniformSpline, Weights
-from evsplat.ranges import Above, AtLeast
 
 GRID_S = 0.02
 """Spacing of the times at which motion and pose have their price."""
@@ -32,21 +30,21 @@ _ENOUGH = 2e-4
 class FitSettings:
     """Prices of a fit; the defaults were chosen on staged captures of one character."""
 
-    knot_s: Annotated[float, Above(0)] = 0.04
+    knot_s: float = 0.04
     """Time between control points."""
-    depth: Annotated[float, AtLeast(0)] = 0.3
+    depth: float = 0.3
     """Weight of the detector's depths."""
-    depth_m: Annotated[float, Above(0)] = 0.08
+    depth_m: float = 0.08
     """Their standard deviation, metres."""
-    prior: Annotated[float, AtLeast(0)] = 1.0
+    prior: float = 1.0
     """Weight of the pose prior."""
-    calm: Annotated[float, AtLeast(0)] = 10.0
+    calm: float = 10.0
     """Weight of accelerations."""
-    shape: Annotated[float, AtLeast(0)] = 0.2
+    shape: float = 0.2
     """Weight of squared shape coefficients."""
-    height_m: Annotated[float, Above(0)] | None = None
+    height_m: float | None = None
     """Known stature, crown to sole."""
-    independent_s: Annotated[float, Above(0)] = 0.4
+    independent_s: float = 0.4
     """Time after which a detector's errors are new: it divides the covariance."""
 
 
@@ -175,7 +173,8 @@ class Problem:
         total = 0.5 * float((state.control * bent).sum()) + float(
             (state.control * fixed.gradient).sum()
         )
-        total += self._once("constant", lambda: 0.0)
+        mean, precision = self.prior.mean, self.prior.precision
+        total += 0.5 * self.settings.prior * float(mean @ precision @ mean)
         shape, pull = self._shape(state)
         if normal is not None:
             normal.gradient += bent
@@ -200,9 +199,6 @@ class Problem:
         calm[SIX], calm[PLACE], calm[TURNS] = 0.4 / _SIX**2, 0.4 / _PLACE_M**2, 0.2 / _TURN_RAD**2
         bends = self.spline.weights(self.grid_s, 2)
         normal.gram(bends, torch.diag(calm), settings.calm / count)
-        self._kept["constant"] = (
-            0.5 * settings.prior * float(self.prior.mean @ self.prior.precision @ self.prior.mean)
-        )
         return normal
 
     def _shape(self, state: State) -> tuple[Tensor, Tensor]:
