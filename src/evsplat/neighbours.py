@@ -37,11 +37,9 @@ def nearest(
     return distance.to(points), index
 
 
-def median_around(
-    points: Float[Tensor, "N 3"], values: Float[Tensor, " N"], k: int
-) -> Float[Tensor, " N"]:
-    """Median of the values of each point's k nearest others, or of all where there are fewer."""
-    return values[nearest(points, min(k, len(points) - 1))[1]].median(1).values
+def median_around(points: Float[Tensor, "N 3"], values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """Median of the values of each point's 16 nearest others, or of all where there are fewer."""
+    return values[nearest(points, min(16, len(points) - 1))[1]].median(1).values
 
 
 def _by_all_distances(

@@ -70,7 +70,7 @@ class SurfaceDiscs(nn.Module):
         self.colours = nn.Parameter(torch.full((count, 3), 0.5))
         self.inset = nn.Parameter(torch.tensor(0.0))
         self.offsets = nn.Parameter(torch.zeros(count))
-        self.register_buffer("near", _nearness(self.samples.points, _ANCHORS))
+        self.register_buffer("near", _nearness(self.samples.points))
         self.layer = nn.Parameter(torch.zeros(self.near.shape[1]))
         self.bone_offsets = nn.Parameter(torch.zeros(len(body.parents), 3))
         self.light = nn.Parameter(torch.zeros(8))
@@ -225,9 +225,9 @@ def _harmonics(normals: Float[Tensor, "*T N 3"]) -> Float[Tensor, "*T N 8"]:
     return torch.stack([x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], -1)
 
 
-def _nearness(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N A"]:
+def _nearness(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N A"]:
     """Shares of A of the points, spread out, in each: rows of unit length."""
-    apart = torch.cdist(points, points[: min(count, len(points))])
+    apart = torch.cdist(points, points[:_ANCHORS])
     near = torch.exp(-0.5 * (apart / _LAYER_REACH_M).square())
     return torch.nn.functional.normalize(near, dim=1)
 

@@ -109,17 +109,17 @@ def _held_out_terms(terms: Terms | None) -> str:
 
 def _chosen_entries(entries: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
     """The most blurred frame, then some evenly spread ones, then others, evenly spread."""
-    hardest = min(entries, key=lambda entry: _known_psnr(entry, 1e9))
+    hardest = min(entries, key=_known_psnr)
     first = [hardest, *(e for e in evenly_spread(entries, _FRAMES_OPEN - 1) if e is not hardest)]
     rest = [entry for entry in entries if entry not in first]
     return [*first, *evenly_spread(rest, max(2, most - len(first)))]
 
 
-def _known_psnr(entry: dict[str, Any], otherwise: float) -> float:
+def _known_psnr(entry: dict[str, Any]) -> float:
     """PSNR of the blurry input on the person, or on the full frame: how hard the frame is."""
     blurry = entry.get("others", {}).get("blurry_input", {})
     known = [blurry[region]["psnr"] for region in ("person_mask", "person_crop", "full") if blurry]
-    return next((value for value in known if value is not None), otherwise)
+    return next((value for value in known if value is not None), float("inf"))
 
 
 @dataclass(frozen=True, eq=False)

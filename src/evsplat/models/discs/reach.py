@@ -16,7 +16,6 @@ SIGMAS = 2.0
 """Standard deviations along its axes at which a disc is taken to end."""
 MOST_M = 0.04
 """How far a disc may reach beyond its neighbours' centres."""
-_NEIGHBOURS = 16
 _LEAST = 0.05
 """Of a disc's size that is left at least, where its centre alone stands farther off."""
 
@@ -35,7 +34,7 @@ def within_reach(
     if len(means) < 2:
         return torch.ones_like(means[:, 0])
     heights = _heights(means, surface)
-    usual = median_around(means, heights, _NEIGHBOURS)
+    usual = median_around(means, heights)
     axes = SIGMAS * quaternion_to_matrix(quaternions) * scales[:, None]
     ends = [_heights(means + way * axis, surface) for axis in axes.unbind(-1) for way in (1, -1)]
     stands, reaches = heights - usual, torch.stack(ends).amax(0) - usual

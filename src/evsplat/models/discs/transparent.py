@@ -27,7 +27,6 @@ OFF, OFF_FROM_M, OFF_MOST_M = 1.0, 0.007, 0.02
 """Price of a pixel of a disc that stands off the body by more than the second farther than its
 neighbours, per squared metre beyond it, of which no more than the third count."""
 ROUNDS = 4
-_NEIGHBOURS = 16
 _DRAWS = 2
 """Random signs per picture that squared slopes are estimated with."""
 _DAMPED = 2
@@ -54,7 +53,7 @@ def off_the_body(
     """
     means = means.detach()
     heights = ((means - surface.surface.points[surface.at(means)]) * normals).sum(-1)
-    return heights - median_around(means, heights, _NEIGHBOURS)
+    return heights - median_around(means, heights)
 
 
 def prices(

@@ -15,6 +15,8 @@ from evsplat.models.networks.body_box import BodyBox
 from evsplat.models.networks.mlp import PointMLP
 from evsplat.models.networks.pose_encoder import PoseEncoder, normalise_joints
 
+COLOUR_FEATURE_DIM = 16
+"""Values for the network of the person's colour."""
 _NOISE_PROBABILITY = 0.5
 
 
@@ -213,7 +215,7 @@ class NonRigidNetwork(nn.Module):
         pose_dim: int,
         width: int = 128,
         depth: int = 3,
-        feature_dim: int = 16,
+        feature_dim: int = COLOUR_FEATURE_DIM,
         last_layer_std: float | None = 1e-3,
         bins: int = 16,
     ) -> None:
@@ -242,24 +244,13 @@ class NonRigidNetwork(nn.Module):
 class PoseDeformation(BodyBox):
     """Pose encoder and non-rigid network over the body's box."""
 
-    def __init__(
-        self,
-        body: Body,
-        *,
-        width: int,
-        feature_dim: int,
-        last_std: float | None,
-    ) -> None:
-        """``feature_dim`` values for a colour network; ``last_std`` as in `NonRigidNetwork`."""
+    def __init__(self, body: Body, *, width: int, last_std: float | None) -> None:
+        """``last_std`` as in `NonRigidNetwork`."""
         super().__init__(body)
         joints = normalise_joints(body.rest_joints, body.rest_vertices)
         self.pose_encoder = PoseEncoder(body.parents.tolist(), joints)
-        self.network = NonRigidNetwork(
-            self.pose_encoder.dim,
-            width=width,
-            feature_dim=feature_dim,
-            last_layer_std=last_std,
-        )
+        dim = self.pose_encoder.dim
+        self.network = NonRigidNetwork(dim, width=width, last_layer_std=last_std)
 
     def inside_box(self, positions: Float[Tensor, "N 3"]) -> Tensor:
         """Mask (N,) of positions, canonical metres, inside that box."""

@@ -24,7 +24,11 @@ from evsplat.models.networks.colour import (
     view_directions,
     view_jitter,
 )
-from evsplat.models.networks.non_rigid import PoseDeformation, draw_pose_noise
+from evsplat.models.networks.non_rigid import (
+    COLOUR_FEATURE_DIM,
+    PoseDeformation,
+    draw_pose_noise,
+)
 from evsplat.models.networks.skinning_network import SkinningNetwork, SkinningTurns
 from evsplat.models.paper.per_frame import FrameLatents, FramePoses, UnseenFrames
 from evsplat.models.paper.placement import Placement, StraightThrough
@@ -32,8 +36,6 @@ from evsplat.render import LOW_PASS
 
 LATENT_DIM = 16
 """Size of the per-frame latent of the person's colour."""
-COLOUR_FEATURE_DIM = 16
-"""Values that the non-rigid network gives to the person's colour."""
 
 Semantics = Literal["fixed", "ste", "rendered"]
 """Teacher of the attribute: none, straight-through placement, the rendered attribute."""
@@ -103,9 +105,7 @@ class PaperModel(PosedModel):
         self.scene_direction_dropout = scene_direction_dropout
         self.placement = StraightThrough() if semantics == "ste" else Placement()
         last_std = None if released else 1e-3
-        self.deformation = PoseDeformation(
-            body, width=width, feature_dim=COLOUR_FEATURE_DIM, last_std=last_std
-        )
+        self.deformation = PoseDeformation(body, width=width, last_std=last_std)
         self.skinning = SkinningNetwork(body.parents.tolist(), width=width)
         self.skinning_turns = SkinningTurns(1 if released else 4)
         self.human_colour = HumanColour(
