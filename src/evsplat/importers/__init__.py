@@ -26,7 +26,7 @@ from evsplat.landmarks.keypoint_files import read_points
 from evsplat.options import PoseOptions, PoseSearch
 from evsplat.options.declare import given
 
-__all__ = ["KINDS", "Blur", "Importer", "attach_poses", "import_capture", "run_importer"]
+__all__ = ["KINDS", "Blur", "attach_poses", "import_capture", "run_importer"]
 
 logger = logging.getLogger(__name__)
 

@@ -7,11 +7,7 @@ from evsplat.inspection.body_check import (
     fit_sheet,
     save_fit_sheet,
 )
-from evsplat.inspection.capture import (
-    InspectReport,
-    inspect_capture,
-    warn_of_capture,
-)
+from evsplat.inspection.capture import inspect_capture, warn_of_capture
 from evsplat.inspection.event_check import warn_of_events
 from evsplat.inspection.folder import default_folder
 from evsplat.inspection.picture_check import warn_of_pictures
@@ -19,7 +15,6 @@ from evsplat.inspection.recording import inspect, inspect_recording
 
 __all__ = [
     "Belonging",
-    "InspectReport",
     "body_mask_overlap",
     "check_body",
     "default_folder",

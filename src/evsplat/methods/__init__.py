@@ -74,7 +74,6 @@ __all__ = [
     "NOMINAL_ITERATIONS",
     "TRAINABLE",
     "Composition",
-    "Method",
     "MethodConfig",
     "Purpose",
     "event_use",

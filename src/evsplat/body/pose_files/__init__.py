@@ -11,7 +11,7 @@ from evsplat.body.pose_files.sequence import PoseSequence
 from evsplat.body.pose_files.transfer import skeleton_motion, to_default_body
 from evsplat.errors import DataError
 
-__all__ = ["FORMATS", "PoseSequence", "read_poses", "skeleton_motion", "to_default_body"]
+__all__ = ["PoseSequence", "read_poses", "skeleton_motion", "to_default_body"]
 
 
 @dataclass(frozen=True)
