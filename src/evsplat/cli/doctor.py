@@ -161,30 +161,21 @@ def _opencv() -> Check:
 def _super_slomo() -> Check:
     from evsplat.synthesis.super_slomo import CHECKPOINT
 
-    try:
-        return Check("Super SloMo", "ok", f"weights {CHECKPOINT.find()}")
-    except WeightsError as error:
-        return Check("Super SloMo", "optional", str(error))
+    return _weights("Super SloMo", lambda: f"weights {CHECKPOINT.find()}")
 
 
 def _restorer(name: str) -> Check:
     from evsplat.restore import WEIGHT_FILES
 
     file = WEIGHT_FILES[name]
-    try:
-        return Check(file.network, "ok", f"weights {file.find()}")
-    except WeightsError as error:
-        return Check(file.network, "optional", str(error))
+    return _weights(file.network, lambda: f"weights {file.find()}")
 
 
 def _pienet() -> Check:
     from evsplat.restore.pienet import DISTRIBUTION, find_weights
 
-    try:
-        found = find_weights()
-        return Check("PIE-Net", "ok", f"{found.name} of {DISTRIBUTION} {_version(DISTRIBUTION)}")
-    except WeightsError as error:
-        return Check("PIE-Net", "optional", str(error))
+    package = f"{DISTRIBUTION} {_version(DISTRIBUTION)}"
+    return _weights("PIE-Net", lambda: f"{find_weights().name} of {package}")
 
 
 def _recordings() -> Check:
@@ -223,10 +214,15 @@ def _lpips(network: Literal["alex", "vgg"]) -> Check:
 def _rvm() -> Check:
     from evsplat.masks.rvm import find_weights
 
+    return _weights("RVM masks", lambda: str(find_weights()))
+
+
+def _weights(name: str, found: Callable[[], str]) -> Check:
+    """What is ``found`` of a network, or the `WeightsError` that says how to get it."""
     try:
-        return Check("RVM masks", "ok", f"{find_weights()}")
+        return Check(name, "ok", found())
     except WeightsError as error:
-        return Check("RVM masks", "optional", str(error))
+        return Check(name, "optional", str(error))
 
 
 def _version(distribution: str) -> str | None:
