@@ -258,8 +258,6 @@ def flatten(prefix: str, state: dict[Any, Any]) -> dict[str, Tensor]:
         name = f"{prefix}.{key}"
         if isinstance(value, dict):
             flat |= flatten(name, value)
-        elif isinstance(value, Tensor):
-            flat[name] = value
         else:
             flat[name] = torch.as_tensor(value)
     return flat
