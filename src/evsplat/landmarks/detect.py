@@ -140,7 +140,6 @@ def crop(
     picture: Float[Tensor, "H W 3"], region: Region, mirrored: bool
 ) -> Float[Tensor, "256 256 3"]:
     """The picture in a region, black beyond its border."""
-    height, width = picture.shape[:2]
     channels = picture.movedim(-1, 0)[None]
     shrink = max(1, round(region.side / SIDE))
     if shrink > 1:  # else every second pixel of a large picture would count alone
