@@ -10,6 +10,7 @@ import time
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -399,6 +400,65 @@ def test_settings_edited_after_the_start_are_refused(trained, capsys):
         load_run(out)
     path.write_text(written)
     assert load_run(out).iteration == 3
+
+
+def longer_focal(document, body):
+    document["cameras"]["main"]["K"][0][0] *= 1.1
+
+
+def later_exposures(document, body):
+    for frame in document["frames"]:
+        frame["exposure_us"] = [time + 1000 for time in frame["exposure_us"]]
+
+
+def backwards(document, body):
+    body["poses"] = body["poses"][::-1]
+
+
+def of_another_source(document, body):
+    document["body"]["source"] = "estimated"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (longer_focal, "cameras has the digest .* learned by other cameras or exposure times"),
+        (later_exposures, "cameras has the digest"),
+        (backwards, "body has the digest .* learned by other poses or another body"),
+        (of_another_source, "body has the digest"),
+    ],
+)
+def test_a_run_is_not_drawn_by_other_cameras_and_poses(tiny_capture, tmp_path, change, said):
+    path = tiny_capture()
+    out = train(path, out=tmp_path / "run", iterations=1, overrides=small("evsplat"))
+    write_changed(path, change)
+    for read in (lambda: load_run(out), lambda: train(path, out=out, resume=True, iterations=2)):
+        with pytest.raises(DataError, match=f"versions.json: {said}"):
+            read()
+
+
+def test_a_run_is_drawn_by_the_same_cameras_and_poses_written_otherwise(tiny_capture, tmp_path):
+    path = tiny_capture()
+    out = train(path, out=tmp_path / "run", iterations=1, overrides=small("evsplat"))
+
+    def otherwise(document, body):
+        for frame in document["frames"]:
+            frame.pop("sharp", None)
+        body["poses"] = body["poses"].astype(np.float64)
+
+    write_changed(path, otherwise)
+    assert load_run(out).iteration == 1
+
+
+def write_changed(path, change):
+    """A capture with ``change`` made to what capture.json and body.npz hold."""
+    document, body = (
+        json.loads((path / "capture.json").read_text()),
+        dict(np.load(path / "body.npz")),
+    )
+    change(document, body)
+    (path / "capture.json").write_text(json.dumps(document))
+    np.savez(path / "body.npz", **body)
 
 
 @pytest.mark.parametrize("changed", ["capture", "policy"])

@@ -11,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from evsplat.body import nearest_axis
@@ -104,6 +105,7 @@ def write_facts(
             "capture_name": seen.name,
             "training_frames": _frames_of(seen),
             "up": _up_of(seen),
+            **_drawn_by(seen),
             "thresholds_found": thresholds_found,
             "method": method,
             "settings": _settings_of({"method": method, **to_dict(config)}),
@@ -210,10 +212,11 @@ def read_config(folder: RunFolder) -> tuple[str, MethodConfig, dict[str, Any]]:
 def check_capture(
     facts: dict[str, Any], seen: TrainingCapture, folder: RunFolder, method: str
 ) -> None:
-    """Refuse a capture whose training frames, or whose up, are others than when it was trained on.
+    """Refuse a capture whose training frames, cameras, body or up are others than when it trained.
 
-    What is held out now may have been seen then: figures of it would say nothing. Floor and light
-    were learned by what was up, of methods that draw them by it. Runs of before do not tell.
+    What is held out now may have been seen then: figures of it would say nothing. Person and scene
+    fit the cameras and poses that they were learned by. Floor and light were learned by what was
+    up, of methods that draw them by it. Runs of before do not tell.
     """
     then, now = facts.get("training_frames"), _frames_of(seen)
     if then is not None and then != now:
@@ -228,6 +231,33 @@ def check_capture(
             f"{brief(_up_of(seen))} now: floor and light were learned by it; put it back, or train "
             "again."
         )
+    for name, digest in _drawn_by(seen).items():
+        if facts.get(name, digest) != digest:
+            raise DataError(
+                f"{folder.facts}: {name} has the digest {brief(facts[name])}, and in {seen.path} "
+                f"it is {digest!r} now: person and scene were learned by other "
+                f"{_DRAWN_BY[name]}; put them back, or train again."
+            )
+
+
+_DRAWN_BY = {
+    "cameras": "cameras or exposure times (capture.json)",
+    "body": "poses or another body (body.npz)",
+}
+"""What `_drawn_by` names, in words."""
+
+
+def _drawn_by(seen: TrainingCapture) -> dict[str, str]:
+    """Digests of all but pictures and events that training frames are drawn by."""
+    cameras = [seen.camera(frame) for frame in seen.train_frames]
+    body = vars(seen.body_file)
+    return {
+        "cameras": _digest_of(
+            *((frame.exposure_us, seen.transfer(frame)) for frame in seen.train_frames),
+            *(value for camera in cameras for value in vars(camera).values()),
+        ),
+        "body": _digest_of(*(value for name, value in body.items() if name != "path")),
+    }
 
 
 def _up_of(seen: TrainingCapture) -> list[float] | None:
@@ -247,8 +277,20 @@ def _settings_of(values: dict[str, Any]) -> str:
     return _digest(json.dumps(values, sort_keys=True, default=str))
 
 
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+def _digest_of(*values: Any) -> str:
+    """A digest of arrays, whatever their types, and of what else there is as it is written."""
+    arrays = (np.ndarray, torch.Tensor)
+    parts = (
+        np.asarray(value, np.float64).tobytes() if isinstance(value, arrays) else repr(value)
+        for value in values
+    )
+    return _digest("\0".join(_digest(part) for part in parts))
+
+
+def _digest(content: str | bytes) -> str:
+    if isinstance(content, str):
+        content = content.encode("utf-8", "surrogatepass")
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def seen_by_training(capture: Capture, config: MethodConfig) -> TrainingCapture:
