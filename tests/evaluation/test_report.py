@@ -271,7 +271,8 @@ def test_page_of_a_method_without_training_or_truth_or_events(tiny_capture, tmp_
 
 def test_report_needs_an_evaluation(tiny_capture, tmp_path, monkeypatch):
     capture = load_capture(tiny_capture())
-    trained = SimpleNamespace(capture=capture, reconstruction=TruthWithNoise(capture))
+    reconstruction = TruthWithNoise(capture)
+    trained = SimpleNamespace(capture=capture, reconstruction=reconstruction, iteration=12345)
     monkeypatch.setattr(run, "load_run", lambda path: trained)
     (tmp_path / "config.yaml").touch()
     with pytest.raises(DataError, match="evsplat evaluate"):

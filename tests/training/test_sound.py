@@ -65,6 +65,15 @@ def test_a_report_of_other_figures_is_none(run, metrics):
     assert not (run / "report.html").exists()
 
 
+def test_a_report_shows_no_figures_of_an_earlier_step(trained, run):
+    """Beside its clip, which the newest checkpoint draws."""
+    train(trained[0], out=run, resume=True, iterations=3)
+    said = refused(lambda: write_report(run))
+    assert "metrics.json: iteration is 2, and the run's last checkpoint is of step 3" in said
+    evaluate_run(run)
+    assert write_report(run).is_file()
+
+
 def change_state(run: Path, change: Callable[[dict[str, Any], dict[str, Any]], object]) -> None:
     path = latest_checkpoint(run / "checkpoints")
     assert path is not None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from evsplat.config import to_dict
+from evsplat.errors import DataError
 from evsplat.evaluation.evaluator import evaluate
 from evsplat.evaluation.report.page import page
 from evsplat.evaluation.report.source import Source
@@ -17,7 +18,7 @@ from evsplat.options.inputs import check_run_folder
 from evsplat.options.runs import Split
 from evsplat.render import choose_device
 from evsplat.training.run import Run, load_run, opened
-from evsplat.untrusted.faults import MISFITS, broken_as
+from evsplat.untrusted.faults import MISFITS, brief, broken_as
 
 _SIGN = ".evaluating"
 """File in a run folder that is there while it is evaluated, and whose lock the evaluation holds."""
@@ -114,6 +115,12 @@ def _measured(
 def _reported(run: Run, folder: Path, split: Split) -> Path:
     path = folder / name_of("report", split, ".html")
     source = Source.read(folder, run.capture, run.reconstruction, split)
+    measured = source.metrics.get("iteration")
+    if measured != run.iteration:
+        raise DataError(
+            f"{folder / name_of('metrics', split, '.json')}: iteration is {brief(measured)}, and "
+            f"the run's last checkpoint is of step {run.iteration}; evaluate the run again."
+        )
     with broken_as(
         folder,
         "its figures are not as evsplat evaluate writes them",
