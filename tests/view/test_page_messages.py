@@ -57,6 +57,7 @@ def test_a_camera_is_of_numbers_that_can_be_drawn(name, number):
         ("wxyz", (1.0, 0.0)),
         ("position", 5),
         ("position", {"x": 1}),
+        ("look_at", CAMERA["position"]),  # no direction to look in
         ("fov", 0),
         ("fov", math.pi),
         ("fov", -1.0),

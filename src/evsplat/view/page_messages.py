@@ -14,6 +14,7 @@ MOST_BYTES = 1 << 16
 _LONGEST_PX, _MOST_PX = 16_384, 36_000_000
 """Of a window: a saved picture has all of its pixels, and 8k has 33 million."""
 _FARTHEST = 1e9
+_NEAREST = 1e-6
 _LEAST_FOV = 1e-4
 _LONGEST_TEXT = 200
 _VECTORS = {"position": 3, "look_at": 3, "up_direction": 3, "wxyz": 4}
@@ -43,6 +44,8 @@ def _check_camera(message: Mapping[str, Any]) -> None:
             raise ValueError(f"{name}: expected {length} numbers")
         if not all(_is_number(value) and abs(value) <= _FARTHEST for value in values):
             raise ValueError(f"{name}: expected numbers of {_FARTHEST:g} at most")
+    if math.dist(message["look_at"], message["position"]) < _NEAREST:
+        raise ValueError("look_at: expected another place than position")
     if not 0.5 < math.hypot(*message["wxyz"]) < 2:
         raise ValueError("wxyz: expected a unit quaternion")
     fov: Any = message.get("fov")
