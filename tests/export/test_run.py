@@ -1,6 +1,7 @@
 """Which Gaussians of a run leave it, and what is said where that cannot be."""
 
 from ast import literal_eval
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import export_run
+from evsplat.models.solid_scene import SolidScene
 from evsplat.render import render
 
 from .clouds import read_ply
@@ -81,6 +83,24 @@ def test_ply_of_a_run_is_the_instant_asked_for_in_metres(run, reconstruction):
     assert f"time_us: {time_us}" in comments
     (person,) = model.splats(capture.camera(capture.frames[1]), [time_us], parts="human")
     np.testing.assert_allclose(columns["z"], person.means[0, :, 2].numpy(), atol=1e-6)
+
+
+def test_files_hold_the_scene_that_lets_nothing_through(run, reconstruction):
+    _, model = reconstruction
+    _, learned = read_ply(export_run(run.path, "ply"))
+    count = len(learned["x"]) - 150
+    generator = torch.Generator().manual_seed(0)
+    scales = 0.1 + torch.rand(count, 3, generator=generator)
+    opacities, rgb = torch.rand(count, 4, generator=generator).split((1, 3), 1)
+    turned = torch.eye(4)[:1].expand(count, 4)
+    run.reconstruction = replace(model, solid=SolidScene(turned, scales, opacities[:, 0], rgb))
+    _, made = read_ply(export_run(run.path, "ply", out=run.path / "solid.ply"))
+    found = 1 / (1 + np.exp(-made["opacity"][150:]))
+    np.testing.assert_allclose(found, opacities[:, 0].numpy(), atol=1e-5)
+    np.testing.assert_allclose(np.exp(made["scale_1"][150:]), scales[:, 1].numpy(), rtol=1e-5)
+    for name, column in learned.items():
+        rows = slice(None) if name in "xyz" else slice(150)
+        np.testing.assert_array_equal(made[name][rows], column[rows])
 
 
 def test_a_pose_file_without_a_rate_is_exported_at_the_one_that_is_given(

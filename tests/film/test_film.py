@@ -54,7 +54,7 @@ class _Lamp:
     def in_new_motion(self, track):
         return _Lamp(track)
 
-    def changed_by(self, *changes):
+    def elsewhere(self, *changes):
         return self
 
 
@@ -329,7 +329,7 @@ def test_the_edge_of_what_was_recorded_is_soft_from_wherever_else_it_is_seen(
     path.write_text(json.dumps(camera_path_document([capture.cameras["side"]])))
     asked = {"recorder": {}, "another": {"camera": "side"}, "one key": {"path": str(path)}}
     made = []
-    monkeypatch.setattr(_Lamp, "changed_by", lambda lamp, *changes: made.extend(changes) or lamp)
+    monkeypatch.setattr(_Lamp, "elsewhere", lambda lamp, *changes: made.extend(changes) or lamp)
     FilmPlan.of(Film(**asked[seen_by]), capture, _Lamp(load_body_track(capture)))
     rooms = [change.__self__ for change in made if change.__name__ == "soften"]
     assert len(rooms) == (seen_by != "recorder")

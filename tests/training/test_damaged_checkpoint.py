@@ -68,6 +68,9 @@ DRAWN = {
     "deformation.handles holds": tensor("model.deformation.handles", lambda v: v + torch.inf),
     "deformation.handles": tensor("model.deformation.handles", lambda v: v[:, :50]),
     "what was seen holds": tensor("seen.weight", lambda v: v * torch.nan),
+    "a solid scene holds": tensor("solid.scales", lambda v: v * torch.nan),
+    "a solid scene is of shapes": tensor("solid.rgb", lambda v: v[:20]),
+    "'opacities'": lambda tensors, state: tensors.pop("solid.opacities"),
     "Gaussians of the person": lambda tensors, state: state.update(human_count=10**9),
 }
 RESUMED = {

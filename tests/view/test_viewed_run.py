@@ -136,7 +136,7 @@ def test_from_elsewhere_holes_show_a_room_and_the_rest_what_films_show(run):
     recording = camera if run.capture.is_static_camera else None
     room = CalmRoom.of(track, track, recording)
     assert np.abs(empty - room.behind(away, time_us).numpy()).max() < 0.05
-    drawn = run.reconstruction.changed_by(room.clear, room.soften)
+    drawn = run.reconstruction.elsewhere(room.clear, room.soften)
     drawn = replace(drawn, backdrop=None)
     expected = Look(surroundings=room).expose(drawn, camera, [time_us])[0] / 255
     found = viewed.picture(camera, time_us, Motion(), Look(), draft=False, elsewhere=True)

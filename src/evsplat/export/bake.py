@@ -72,7 +72,9 @@ def export_avatar(
     clips.insert(0, recorded_clip(source, (min(mids), max(mids))))
     loss = measure_loss(source, avatar, capture)
     instant = instant_of(capture, time_s=None, frame=None, camera=camera)
-    scene = cloud_at(source, instant.camera, instant.time_us, "scene") if parts == "all" else None
+    scene = None
+    if parts == "all":
+        scene = cloud_at(source.elsewhere(), instant.camera, instant.time_us, "scene")
     facts = {**facts_of(run), "note": loss.sentence(), "loss_db": asdict(loss)}
     facts["low_pass_px2"] = source.low_pass
     page = write_avatar(

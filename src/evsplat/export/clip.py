@@ -61,7 +61,7 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         server.initial_camera.look_at = tuple(ahead.tolist())
         server.initial_camera.fov = 2 * math.atan(view.height / 2 / float(view.K[1, 1]))
         if parts != "human":
-            layers = source.splats(middle.camera, [middle.time_us], parts=parts)
+            layers = source.elsewhere().splats(middle.camera, [middle.time_us], parts=parts)
             _show(server, "/scene", cloud_of(layers[-1]).shown(transfer))
         serializer = server.get_scene_serializer()
         handle = None

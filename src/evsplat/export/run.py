@@ -111,7 +111,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         instant = instant_of(
             capture, time_s=options.time_s, frame=options.frame, camera=options.camera
         )
-        source = run.reconstruction
+        source = run.reconstruction.elsewhere()
         cloud = cloud_at(source, instant.camera, instant.time_us, parts or "all")
         viewers = source.low_pass if options.low_pass is None else options.low_pass
         cloud = for_viewer(cloud, instant.camera, source.low_pass, viewers)

@@ -84,7 +84,7 @@ class FilmPlan:
         if surroundings is not None and recorder is not None and elsewhere:
             changes.append(room.soften)
         if changes:
-            reconstruction = reconstruction.changed_by(*changes)
+            reconstruction = reconstruction.elsewhere(*changes)
         cameras = _of_height(cameras, film.size)
         frames = [FilmFrame(*fields) for fields in zip(names, times, clock, cameras, strict=True)]
         return cls(

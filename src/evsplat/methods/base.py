@@ -18,6 +18,7 @@ from evsplat.methods.learning import Learning
 from evsplat.methods.settings import Weight
 from evsplat.models.at_rest import Skinned
 from evsplat.models.seen import Seen
+from evsplat.models.solid_scene import SolidScene
 from evsplat.objectives import Objective, PackedBounds
 
 _MOST_BODY_FRAMES = 512
@@ -87,9 +88,9 @@ class Composition:
     recording: Camera | None = None
     """The camera at rest, which sees no depth: the scene stays as far away from it as it starts,
     and goes on beside the recorded picture. None: it moves anywhere, and black is beside it."""
-    fill: Callable[[Seen], dict[str, Tensor]] | None = None
+    fill: Callable[[Seen], tuple[dict[str, Tensor], SolidScene | None]] | None = None
     """Parameters by their names in the model's state, as a prior decides them at the end where
-    little was seen; None: as they were learned."""
+    little was seen, and the scene as it is seen from elsewhere; None: as they were learned."""
     thresholds_found: bool = True
     """False: the method takes events by their contrast thresholds, and neither the capture nor its
     training frames told them where training began."""

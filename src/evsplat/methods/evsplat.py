@@ -41,7 +41,9 @@ from evsplat.models.discs.fill import filled
 from evsplat.models.discs.first_colours import first_colours
 from evsplat.models.discs.outskirts import outskirts
 from evsplat.models.discs.pictured import pictured
+from evsplat.models.discs.solid import solid
 from evsplat.models.seen import Seen
+from evsplat.models.solid_scene import SolidScene
 from evsplat.objectives import (
     DeformationPrior,
     EventChange,
@@ -210,21 +212,22 @@ def _priors(model: DiscModel) -> list[Objective]:
 
 def _filled(
     model: DiscModel, capture: TrainingCapture, config: EvsplatConfig, seen: Seen
-) -> dict[str, Tensor]:
+) -> tuple[dict[str, Tensor], SolidScene | None]:
     """What the end of training decides of the person, and of the scene that one camera saw."""
     decided = filled(model, capture, config.fill, seen)
     frames = capture.train_frames
     several = len({frame.camera for frame in frames}) > 1
     if config.scene.kind == "random_cube" or several:
-        return decided
+        return decided, None
     recorded = frames[:1] if capture.is_static_camera else frames
     cameras = [capture.camera(frame).to(model.device) for frame in recorded]
     gaussians = model.gaussians
     name = f"gaussians.{gaussians.colour}"
     colours = decided.get(name, gaussians.get_parameter(gaussians.colour)).detach().clone()
     of_scene = pictured(gaussians, cameras[0], model.low_pass) if len(cameras) == 1 else None
-    colours[gaussians.scene] = outskirts(gaussians, cameras, model.low_pass, of_scene).logit()
-    return decided | {name: colours}
+    of_scene = outskirts(gaussians, cameras, model.low_pass, of_scene)
+    colours[gaussians.scene] = of_scene.logit()
+    return decided | {name: colours}, solid(gaussians, cameras, model.low_pass, of_scene)
 
 
 def _background(

@@ -25,9 +25,6 @@ _LEAST_ROOM_M = 0.5
 _DOWN = 1e-4
 """Sine of the steepest ray that no longer meets the floor."""
 _INSTANTS = 16
-_LET_THROUGH = 0.99
-"""Quantile, over the recorded picture, of what its scene lets through: not yet a hole. It is
-trained before black, and its colours make up for that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +43,6 @@ class Beyond:
     floor_rgb: Float[Tensor, "3"]
     """sRGB, as that of the wall."""
     wall_rgb: Float[Tensor, "3"]
-    let_through: float = 0.0
-    """Share of the light from behind that the scene lets through where it was recorded."""
 
     @classmethod
     def of(
@@ -55,13 +50,9 @@ class Beyond:
         recording: Camera,
         track: BodyTrack,
         picture: Float[Tensor, "H W 3"],
-        alpha: Float[Tensor, "H W"],
         depth: Float[Tensor, "H W"],
     ) -> "Beyond":
-        """``picture`` on black, ``alpha`` and ``depth`` (metres) of the scene by ``recording``.
-
-        They are without the person.
-        """
+        """``picture`` and ``depth`` (metres) of the scene by ``recording``, without the person."""
         up = up_axis(track).float().cpu()
         recording = recording.to("cpu")
         floor_m = lowest_m(track, up)
@@ -81,15 +72,13 @@ class Beyond:
             max(_LEAST_ROOM_M, float(wall_m(depth, high) - recording.project(middle)[1])),
             _mean(picture, rim & ~high),
             _mean(picture, rim & high),
-            float((1 - alpha).clamp(0, 1).flatten().quantile(_LET_THROUGH)),
         )
 
     def fill(
         self, rgb: Float[Tensor, "T H W 3"], alpha: Float[Tensor, "T H W"], camera: Camera
     ) -> Float[Tensor, "T H W 3"]:
         """Pictures on black, sRGB, with the room in their holes."""
-        holes = (1 - alpha.clamp(0, 1) - self.let_through) / max(1 - self.let_through, 1e-3)
-        return rgb + holes.clamp_min(0)[..., None] * self.behind(camera).to(rgb)
+        return rgb + (1 - alpha.clamp(0, 1))[..., None] * self.behind(camera).to(rgb)
 
     def behind(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The empty room as ``camera`` sees it, sRGB."""

@@ -17,6 +17,7 @@ from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_sc
 from evsplat.models.kept import Kept
 from evsplat.models.layers import Layers
 from evsplat.models.seen import Seen, draw_values
+from evsplat.models.solid_scene import SolidScene
 from evsplat.render import Backdrop, Splats, render
 
 
@@ -38,6 +39,8 @@ class GaussianReconstruction:
     """What a film makes of the posed Gaussians before they are drawn."""
     beyond: Beyond | None = None
     """What pictures of person and scene show where nothing is; black without."""
+    solid: SolidScene | None = None
+    """The scene as it is `elsewhere`; None where the end of training did not make one."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`.
@@ -137,7 +140,8 @@ class GaussianReconstruction:
 
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
-        return GaussianReconstruction(self.name, self.model.following(track), self.seen)
+        model = self.model.following(track)
+        return GaussianReconstruction(self.name, model, self.seen, solid=self.solid)
 
     def in_new_motion(self, track: BodyTrack) -> "GaussianReconstruction":
         """As `following`, for poses that were not recorded: neighbours on the skin stay together.
@@ -148,9 +152,13 @@ class GaussianReconstruction:
         moving.model.stay_together()
         return moving
 
-    def changed_by(self, *changes: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
-        """The same, with the posed Gaussians changed by each in turn before they are drawn."""
-        return replace(self, changes=changes)
+    def elsewhere(self, *changes: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
+        """As it is seen from where it was not recorded: nothing shines through the scene.
+
+        The posed Gaussians are changed by each of ``changes`` in turn before they are drawn.
+        """
+        solid = () if self.solid is None else (self.solid.stand_for,)
+        return replace(self, changes=solid + changes)
 
     @property
     def low_pass(self) -> float:

@@ -165,8 +165,8 @@ class Run:
         time = [int(drawn.track.times_us[0])]
         scene = drawn.render(self.recording, time, parts="scene")
         depth = drawn.depth(self.recording, time, parts="scene")[0]
-        beyond = Beyond.of(self.recording, drawn.track, scene.rgb[0], scene.alpha[0], depth)
-        return replace(drawn.changed_by(beyond.uncovered), beyond=beyond)
+        beyond = Beyond.of(self.recording, drawn.track, scene.rgb[0], depth)
+        return replace(drawn.elsewhere(beyond.uncovered), beyond=beyond)
 
     def what_was_seen(self) -> dict[str, float | None] | None:
         """Share of the person's Gaussians that were little seen, and how rough; see `roughness`.
@@ -330,7 +330,7 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
     )
     check_fits(composition.model, tensors, path)
     with misfits_of(path):
-        seen = load_shown(composition.model, tensors, progress["human_count"])
+        seen, solid = load_shown(composition.model, tensors, progress["human_count"])
     composition.model.requires_grad_(False)
     return Run(
         path=folder.path,
@@ -342,7 +342,9 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
             thresholds_found=facts.get("thresholds_found") is not False,
         ),
         capture=capture,
-        reconstruction=GaussianReconstruction(method, composition.model, seen, Backdrop(), Kept()),
+        reconstruction=GaussianReconstruction(
+            method, composition.model, seen, Backdrop(), Kept(), solid=solid
+        ),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),
         recording=composition.recording,
@@ -365,9 +367,9 @@ def reload_run(run: Run, state: Path) -> Run:
     model = run.reconstruction.model
     tensors, progress = load_checkpoint(state)
     with misfits_of(state):
-        seen = load_shown(model, tensors, progress["human_count"])
+        seen, solid = load_shown(model, tensors, progress["human_count"])
     model.requires_grad_(False)
-    reconstruction = replace(run.reconstruction, seen=seen)
+    reconstruction = replace(run.reconstruction, seen=seen, solid=solid)
     return replace(run, reconstruction=reconstruction, **_progress(model, progress))
 
 

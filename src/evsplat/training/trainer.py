@@ -240,13 +240,16 @@ class Trainer:
     def ending(self) -> dict[str, Tensor]:
         """What the end of training adds to `state`: what was seen, and what a prior then decides.
 
-        The second replaces parameters where the model is drawn. Those that were learned stay as
-        they are, for a training that goes on.
+        The second replaces parameters where the model is drawn, and the third the scene where it
+        is seen from elsewhere. Those that were learned stay as they are, for a training that goes
+        on.
         """
         seen = seen_by(self.model, self.capture)
         tensors = flatten("seen", vars(seen))
         if self.composition.fill is not None:
-            tensors |= flatten("filled", self.composition.fill(seen))
+            filled, solid = self.composition.fill(seen)
+            tensors |= flatten("filled", filled)
+            tensors |= {} if solid is None else flatten("solid", vars(solid))
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:

@@ -119,7 +119,7 @@ class ViewedRun:
             recorded = self.run.reconstruction.track.to("cpu")
             room = CalmRoom.of(recorded, self.track(motion.name).to("cpu"), recording)
             self._rooms[motion.name] = room
-        shown = drawn.changed_by(room.clear, room.soften).render(camera, [time_us])
+        shown = drawn.elsewhere(room.clear, room.soften).render(camera, [time_us])
         rgb, alpha = close_gaps(shown.rgb.cpu(), shown.alpha.cpu().clamp(0, 1), shown.human.cpu())
         picture, holes = self.capture.shown(rgb[0]), 1 - alpha[0, ..., None]
         return (picture + holes * room.behind_coarsely(camera, time_us)).clamp(0, 1).numpy()

@@ -262,12 +262,18 @@ def test_a_run_is_drawn_filled_and_goes_on_unfilled(tiny_capture, tmp_path):
     assert below("filled", tensors) and not below("filled", others) and below("seen", others)
     model, other = below("model", tensors), below("model", others)
     assert all(torch.equal(model[name], other[name]) for name in model)
+    assert below("solid", tensors) and not below("solid", others)
     drawn = load_run(run).reconstruction
-    assert drawn.seen is not None
+    assert drawn.seen is not None and load_run(bare).reconstruction.solid is None
     assert len(drawn.seen.weight) == drawn.model.gaussians.human_count <= state["human_count"]
     colour = drawn.model.gaussians.colour
     frame = load_capture(capture).frames[0]
     camera = load_capture(capture).camera(frame)
+    through = [
+        1 - float(each.render(camera, [frame.mid_us], parts="scene").alpha.mean())
+        for each in (drawn, drawn.elsewhere(), drawn.following(drawn.track).elsewhere())
+    ]
+    assert through[1] < 0.5 * through[0] and through[2] == through[1]
     certain = drawn.certainty(camera, [frame.mid_us], parts="human")[0]
     assert 0 < float(certain.max()) <= 1
     shown = Look("certainty").expose(drawn, camera, [frame.mid_us])[0]

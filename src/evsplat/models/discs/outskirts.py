@@ -13,11 +13,9 @@ from torch import Tensor
 from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
 from evsplat.gaussians.surround import cell_px, continued
-from evsplat.models.discs.scene_pictures import ScenePictures
+from evsplat.models.discs.scene_pictures import ScenePictures, spread_over
 from evsplat.neighbours import nearest
 
-MOST_VIEWS = 12
-"""Pictures of a moving camera that are drawn."""
 STEPS = 16
 """Of conjugate gradients."""
 PRICE = 1 / 800
@@ -42,11 +40,10 @@ def outskirts(
 
     Those closest to that with which the pictures of the scene alone look as before (`closest`).
     What lies within any of them is changed by as little as that takes, and only near its border.
-    ``recorded`` are cameras of one size along one way, of which at most `MOST_VIEWS` are drawn.
+    ``recorded`` are cameras of one size along one way, of which some are drawn (`spread_over`).
     ``colours`` in place of those of ``gaussians``.
     """
-    drawn = torch.linspace(0, len(recorded) - 1, min(MOST_VIEWS, len(recorded))).round().int()
-    views = [recorded[index] for index in drawn.tolist()]
+    views = spread_over(recorded)
     pictures = ScenePictures(gaussians, views, low_pass, colours)
     own = pictures.colours
     cell = cell_px(views[0].width, views[0].height)

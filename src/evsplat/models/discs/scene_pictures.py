@@ -18,9 +18,17 @@ from evsplat.models.discs.still import Still
 from evsplat.models.seen import fixed, shares_by, transposed
 from evsplat.render import render
 
+MOST_VIEWS = 12
+"""Pictures of a moving camera that are drawn."""
 _FAST = 1e6
 _FARTHER = 1.15
 """Least depth of what is hidden as a share of the picture's there."""
+
+
+def spread_over(recorded: Sequence[Camera]) -> list[Camera]:
+    """At most `MOST_VIEWS` of the cameras, evenly."""
+    drawn = torch.linspace(0, len(recorded) - 1, min(MOST_VIEWS, len(recorded))).round().int()
+    return [recorded[index] for index in drawn.tolist()]
 
 
 class ScenePictures:
@@ -51,6 +59,11 @@ class ScenePictures:
         """A picture with these in place of colours."""
         scene = replace(self._scene, channels=values)
         return render(scene, view, low_pass=self._low_pass).image
+
+    @torch.no_grad()
+    def covered(self, view: Camera) -> Float[Tensor, "1 H W"]:
+        """Share of the light from behind each pixel that the scene hides."""
+        return self.draw(torch.ones_like(self.means[None, :, :1]), view)[..., 0]
 
     @cached_property
     def squares(self) -> Float[Tensor, " S"]:
