@@ -126,7 +126,8 @@ class ViewedRun:
 
     def cloud(self, camera: Camera, time_us: int, motion: Motion, parts: Parts) -> SplatCloud:
         """The Gaussians of one instant in the world, coloured as ``camera`` sees them."""
-        cloud = cloud_at(self._moving(time_us, motion, draft=False), camera, time_us, parts)
+        drawn = self._moving(time_us, motion, draft=False).elsewhere()
+        cloud = cloud_at(drawn, camera, time_us, parts)
         return cloud.shown(self._transfer)
 
     @property
