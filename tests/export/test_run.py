@@ -85,7 +85,7 @@ def test_ply_of_a_run_is_the_instant_asked_for_in_metres(run, reconstruction):
     np.testing.assert_allclose(columns["z"], person.means[0, :, 2].numpy(), atol=1e-6)
 
 
-def test_files_hold_the_scene_that_lets_nothing_through(run, reconstruction):
+def test_files_hold_the_solid_scene(run, reconstruction):
     _, model = reconstruction
     _, learned = read_ply(export_run(run.path, "ply"))
     count = len(learned["x"]) - 150

@@ -13,6 +13,7 @@ from evsplat.capture import TrainingCapture
 from evsplat.models.at_rest import SkinnedGaussians
 from evsplat.models.layers import Layers
 from evsplat.models.model import Model
+from evsplat.models.stored import stored
 from evsplat.neighbours import nearest
 from evsplat.probes import random_signs
 from evsplat.render import Splats, render
@@ -57,17 +58,9 @@ class Seen:
         """From the tensors by their names, or None where there are none.
 
         Raises:
-            ValueError: They are not those of ``count`` Gaussians.
+            ValueError: They are not those of ``count`` Gaussians, or not finite.
         """
-        if not tensors:
-            return None
-        seen = cls(**{field.name: tensors[field.name] for field in fields(cls)})
-        found = [tuple(value.shape) for value in vars(seen).values()]
-        if found != [(count,), (count,), (count, 3)]:
-            raise ValueError(f"what was seen is of shapes {found}, of {count} Gaussians")
-        if not all(value.isfinite().all() for value in vars(seen).values()):
-            raise ValueError("what was seen holds numbers that are not finite")
-        return seen
+        return stored(cls, "what was seen", tensors, count, directions=3)
 
 
 def seen_by(model: Model, capture: TrainingCapture) -> Seen:

@@ -1,7 +1,7 @@
 """The scene as it is drawn from elsewhere than where it was recorded, and as files hold it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.models.layers import Layers
+from evsplat.models.stored import stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +32,8 @@ class SolidScene:
         Raises:
             ValueError: They are not those of ``count`` Gaussians, or not finite.
         """
-        if not tensors:
-            return None
-        found = cls(**{field.name: tensors[field.name].to(device) for field in fields(cls)})
-        shapes = [tuple(value.shape) for value in vars(found).values()]
-        if shapes != [(count, 4), (count, 3), (count,), (count, 3)]:
-            raise ValueError(f"a solid scene is of shapes {shapes}, of {count} Gaussians")
-        if not all(value.isfinite().all() for value in vars(found).values()):
-            raise ValueError("a solid scene holds numbers that are not finite")
-        return found
+        sent = {name: value.to(device) for name, value in tensors.items()}
+        return stored(cls, "a solid scene", sent, count, quaternions=4, scales=3, rgb=3)
 
     def stand_for(self, layers: Layers, camera: Camera) -> Layers:
         """The same with this scene, from whatever camera."""

@@ -153,7 +153,7 @@ class GaussianReconstruction:
         return moving
 
     def elsewhere(self, *changes: Callable[[Layers, Camera], Layers]) -> "GaussianReconstruction":
-        """As it is seen from where it was not recorded: nothing shines through the scene.
+        """As it is seen from where it was not recorded: with the `solid` scene, if there is one.
 
         The posed Gaussians are changed by each of ``changes`` in turn before they are drawn.
         """

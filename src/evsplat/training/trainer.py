@@ -249,7 +249,8 @@ class Trainer:
         if self.composition.fill is not None:
             filled, solid = self.composition.fill(seen)
             tensors |= flatten("filled", filled)
-            tensors |= {} if solid is None else flatten("solid", vars(solid))
+            if solid is not None:
+                tensors |= flatten("solid", vars(solid))
         return tensors
 
     def load_state(self, tensors: dict[str, Tensor], state: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from evsplat.camera import Camera
 from evsplat.gaussians import GaussianSet
 from evsplat.gaussians.surround import cell_px, continued
-from evsplat.models.discs.scene_pictures import ScenePictures, spread_over
+from evsplat.models.discs.scene_pictures import SEEN, ScenePictures, spread_over
 from evsplat.neighbours import nearest
 
 STEPS = 16
@@ -23,9 +23,9 @@ PRICE = 1 / 800
 _BEYOND, _RIM = 0.25, 2.0
 """Cells beyond a border from which on a Gaussian is outside, and up to which from the border inside
 colours may make up for what is missed of those."""
-_HIDDEN, _SEEN, _AROUND = 0.02, 0.1, 16
-"""Squared shares of pixels below which a Gaussian within a picture is hidden, and from which it is
-seen; and of how many that are seen a hidden one has the mean colour."""
+_HIDDEN, _AROUND = 0.02, 16
+"""Squared shares of pixels below which a Gaussian within a picture is hidden; and of how many that
+are seen a hidden one has the mean colour."""
 
 
 def outskirts(
@@ -55,7 +55,7 @@ def outskirts(
         rows = outside & (closest_view == index)
         places = view.project(pictures.means)[0]
         told[rows] = continued(picture[0].cpu(), places[rows].cpu(), cell).to(own.device)
-    shown = ~outside & (pictures.squares > _SEEN)
+    shown = ~outside & (pictures.squares > SEEN)
     # What one of several views hides another may show.
     if len(views) == 1 and shown.sum() >= _AROUND:
         hidden = ~near & (pictures.squares < _HIDDEN) & pictures.behind(views[0])

@@ -20,6 +20,8 @@ from evsplat.render import render
 
 MOST_VIEWS = 12
 """Pictures of a moving camera that are drawn."""
+SEEN = 0.1
+"""Squared shares of pixels from which on a Gaussian is seen."""
 _FAST = 1e6
 _FARTHER = 1.15
 """Least depth of what is hidden as a share of the picture's there."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from evsplat.camera import Camera
 from evsplat.gaussians import Adam, GaussianSet
-from evsplat.models.discs.scene_pictures import ScenePictures, spread_over
+from evsplat.models.discs.scene_pictures import SEEN, ScenePictures, spread_over
 from evsplat.models.layers import scene_splats
 from evsplat.models.solid_scene import SolidScene
 from evsplat.render import render
@@ -27,8 +27,6 @@ PRICE = 0.03
 """Of the square of what shines through a pixel, against that of a difference of its colours."""
 _HOLE = 0.5
 """Share of the light from behind from which on nothing is there."""
-_SEEN = 0.1
-"""Squared shares of pixels from which on they tell of a Gaussian; Adam moves the others as far."""
 
 
 def solid(
@@ -47,7 +45,8 @@ def solid(
     pictures = ScenePictures(gaussians, views, low_pass, colours)
     filled = [pictures.covered(view) > 1 - _HOLE for view in views]
     outside = torch.stack([pictures.cells_beyond(view) for view in views]).amin(0) > 0
-    kept = outside | (pictures.squares < _SEEN)
+    # Adam would move those of which next to nothing tells as far as the others.
+    kept = outside | (pictures.squares < SEEN)
     rows = gaussians.scene
     own = gaussians.scales_log[rows].detach().exp()
     learned = {
