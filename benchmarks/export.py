@@ -8,9 +8,9 @@ r"""Exported files drawn by renderers of others, and the avatar page, beside our
 A test frame is exported as .ply, .spz and .splat, drawn by Spark (WebGL) in headless Chromium
 from the recording camera, and compared with evsplat's own picture: with Spark set to the rules of
 3DGS, and as it comes. Babylon.js, gsplat.js, PlayCanvas and GaussianSplats3D, all as they come,
-draw the .ply, and it exported with `--low-pass 0.075` and `0.3`. The avatar page is compared with
-the same avatar drawn by our rasteriser, and timed. The files are also read by gsply where that is
-installed. The last line is JSON.
+draw the .ply, and it exported with `--low-pass` as trained and `0.3`. The avatar page is compared
+with the same avatar drawn by our rasteriser, and timed. The files are also read by gsply where that
+is installed. The last line is JSON.
 """
 
 import argparse
@@ -106,23 +106,22 @@ def compare(arguments: argparse.Namespace, folder: Path, out: Path) -> dict[str,
 def exported(run: Run, camera: Camera, frame: Frame, site: Path) -> list[dict[str, Any]]:
     """Write the run at a frame as every file that is drawn; gives what to draw of each."""
     source = run.reconstruction
+    own = source.low_pass
     shots: list[dict[str, Any]] = []
     for kind in ("ply", "spz", "splat"):
-        file, own = site / f"run.{kind}", source.low_pass
+        file = site / f"run-trained.{kind}"
         ev.export_run(run.path, kind, frame=frame.name, out=file, low_pass=own, device="cpu")
         view = seen_from(camera, file_rotation(source.track, kind, None))
         for rules in ("3dgs", "default"):
             shots.append(
-                {"page": "spark.html", "file": f"run.{kind}", "rules": rules, "camera": view,
-                 "low_pass": source.low_pass, "picture": f"spark-{kind}-{rules}.png"}
+                {"page": "spark.html", "file": file.name, "rules": rules, "camera": view,
+                 "low_pass": own, "picture": f"spark-{kind}-{rules}.png"}
             )  # fmt: skip
-    for low_pass in (None, 0.075, 0.3):
-        name = "run.ply" if low_pass is None else f"run-{low_pass}.ply"
-        out_file = site / name
+    view = seen_from(camera, file_rotation(source.track, "ply", None))
+    for name, low_pass in {"run.ply": None, "run-trained.ply": own, "run-0.3.ply": 0.3}.items():
         ev.export_run(
-            run.path, "ply", out=out_file, frame=frame.name, low_pass=low_pass, device="cpu"
+            run.path, "ply", out=site / name, frame=frame.name, low_pass=low_pass, device="cpu"
         )
-        view = seen_from(camera, file_rotation(source.track, "ply", None))
         for viewer in VIEWERS:
             shots.append(
                 {"page": f"{viewer}.html", "file": name, "camera": view,
@@ -192,7 +191,8 @@ def gsply_agrees(site: Path) -> dict[str, float]:
         import gsply
     except ImportError:
         return {}
-    ply, spz = gsply.plyread(str(site / "run.ply")), gsply.read_spz(str(site / "run.spz"))
+    file = site / "run-trained.ply"
+    ply, spz = gsply.plyread(str(file)), gsply.read_spz(str(file.with_suffix(".spz")))
     turn = np.linalg.lstsq(ply.means, spz.means, rcond=None)[0]
     return {
         "gsply_spz_centre_error_m": round(float(np.abs(ply.means @ turn - spz.means).max()), 7),

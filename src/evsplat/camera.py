@@ -9,6 +9,9 @@ from torch import Tensor
 
 from evsplat.devices import send
 
+MOST_VIEWS = 12
+"""Cameras of a recording by one that moves which stand for all of them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -90,3 +93,9 @@ def distinct(cameras: Sequence[Camera]) -> tuple[Camera, ...]:
     """The cameras of pictures; one alone where all are the same object, as of a camera at rest."""
     first = cameras[0]
     return (first,) if all(camera is first for camera in cameras) else tuple(cameras)
+
+
+def spread_over(recorded: Sequence[Camera]) -> list[Camera]:
+    """At most `MOST_VIEWS` of the cameras of a recording, evenly."""
+    chosen = torch.linspace(0, len(recorded) - 1, min(MOST_VIEWS, len(recorded))).round().int()
+    return [recorded[index] for index in chosen.tolist()]

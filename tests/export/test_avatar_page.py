@@ -15,6 +15,7 @@ from evsplat.capture import load_capture
 from evsplat.export import export_run
 from evsplat.export.avatar import avatar_of
 from evsplat.export.bake import at_rest, with_correctives
+from evsplat.models.smoothing import widened
 from evsplat.pictures import shown
 from evsplat.render import render
 from evsplat.similarity import psnr
@@ -60,8 +61,8 @@ def _drawn_by_browser(page, camera, folder) -> torch.Tensor:
 
 
 @needs_browser
-@pytest.mark.parametrize("transfer", ["power", "linear"])
-def test_the_page_shows_what_our_rasteriser_draws(run, tmp_path, transfer):
+@pytest.mark.parametrize(("transfer", "times_larger"), [("power", 1), ("linear", 1), ("power", 3)])
+def test_the_page_shows_what_our_rasteriser_draws(run, tmp_path, transfer, times_larger):
     """Pictures that hold light are coded for the screen, of which the page said nothing."""
     described = run.capture.path / "capture.json"
     document = json.loads(described.read_text(encoding="utf-8"))
@@ -72,11 +73,13 @@ def test_the_page_shows_what_our_rasteriser_draws(run, tmp_path, transfer):
     source = run.reconstruction
     page = export_run(run.path, "avatar", out=tmp_path / "dancer.html")
     frame = capture.frames[len(capture.frames) // 2]
-    camera, time = capture.camera(frame), capture.frames[0].mid_us + 100_000
+    recorder, time = capture.camera(frame), capture.frames[0].mid_us + 100_000
+    camera = recorder.resized(times_larger * recorder.width, times_larger * recorder.height)
     rotations, bones = source.pose([time])
     avatar = avatar_of(with_correctives(run, at_rest(run, None), None))
     with torch.no_grad():
         person = avatar.gaussians.posed(bones, rotations)
+        person = widened(person, source.low_pass, camera, [recorder])
         image = render(person, camera, low_pass=source.low_pass).image[0]
     want = shown(image[..., :3].clamp(0, 1), transfer)
     got = _drawn_by_browser(page, camera, tmp_path)

@@ -86,6 +86,9 @@ class _Clock:
     name = "clock"
     track = BodyTrack(default_body(), np.zeros(1), np.zeros((1, 31, 3)), np.zeros((1, 3)))
 
+    def at_any_size(self):
+        return self
+
     def render(self, camera, times_us, *, parts="all"):
         levels = torch.tensor([time / 1000 / 255 for time in times_us])
         rgb = levels[:, None, None, None].expand(-1, camera.height, camera.width, 3)

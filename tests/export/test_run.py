@@ -12,6 +12,7 @@ from evsplat.body.smpl_skeleton import JOINTS
 from evsplat.capture import load_body_track
 from evsplat.errors import ConfigError, DataError
 from evsplat.export import export_run
+from evsplat.models.smoothing import widened
 from evsplat.models.solid_scene import SolidScene
 from evsplat.render import render
 
@@ -87,14 +88,15 @@ def test_ply_of_a_run_is_the_instant_asked_for_in_metres(run, reconstruction):
 
 def test_files_hold_the_solid_scene(run, reconstruction):
     _, model = reconstruction
-    _, learned = read_ply(export_run(run.path, "ply"))
+    as_trained = {"low_pass": model.low_pass}
+    _, learned = read_ply(export_run(run.path, "ply", **as_trained))
     count = len(learned["x"]) - 150
     generator = torch.Generator().manual_seed(0)
     scales = 0.1 + torch.rand(count, 3, generator=generator)
     opacities, rgb = torch.rand(count, 4, generator=generator).split((1, 3), 1)
     turned = torch.eye(4)[:1].expand(count, 4)
     run.reconstruction = replace(model, solid=SolidScene(turned, scales, opacities[:, 0], rgb))
-    _, made = read_ply(export_run(run.path, "ply", out=run.path / "solid.ply"))
+    _, made = read_ply(export_run(run.path, "ply", out=run.path / "solid.ply", **as_trained))
     found = 1 / (1 + np.exp(-made["opacity"][150:]))
     np.testing.assert_allclose(found, opacities[:, 0].numpy(), atol=1e-5)
     np.testing.assert_allclose(np.exp(made["scale_1"][150:]), scales[:, 1].numpy(), rtol=1e-5)
@@ -179,3 +181,22 @@ def test_an_avatar_that_is_there_is_told_before_the_work(run, monkeypatch, tmp_p
     with pytest.raises(DataError, match="already"):
         export_run(run.path, "avatar", out=None if out is None else folder)
     assert [path.name for path in folder.iterdir()] == ["index.html"]
+
+
+def test_larger_pictures_show_gaussians_as_wide_as_the_recorded_ones(reconstruction):
+    """In films and elsewhere; pictures of the recorded size stay bit for bit."""
+    capture, model = reconstruction
+    frame = capture.frames[3]
+    camera, time = capture.camera(frame), [frame.mid_us]
+    model = replace(model, recorders=(camera,))
+    larger = camera.resized(4 * camera.width, 4 * camera.height)
+    for shown in (
+        model.at_any_size(),
+        model.elsewhere(),
+        model.at_any_size().following(model.track),
+    ):
+        assert torch.equal(shown.render(camera, time).rgb, model.render(camera, time).rgb)
+        for made, thin in zip(shown.splats(larger, time), model.splats(larger, time), strict=True):
+            wide = widened(thin, model.low_pass, larger, [camera])
+            assert (wide.scales > thin.scales).all()
+            torch.testing.assert_close(made.scales, wide.scales)

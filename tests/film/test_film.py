@@ -57,6 +57,8 @@ class _Lamp:
     def elsewhere(self, *changes):
         return self
 
+    at_any_size = elsewhere
+
 
 @pytest.fixture
 def lamp(tiny_capture, tmp_path, monkeypatch):

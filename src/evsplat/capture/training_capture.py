@@ -153,6 +153,11 @@ class TrainingCapture:
         """True where all frames come from one camera that stands still."""
         return self._source.is_static_camera
 
+    def recorders(self) -> list[Camera]:
+        """Cameras of the training frames, of a camera that stands still the one."""
+        frames = self.train_frames
+        return [self.camera(frame) for frame in (frames[:1] if self.is_static_camera else frames)]
+
     def image(self, frame: Frame | str) -> Float[Tensor, "H W 3"]:
         """The blurry picture of a training frame."""
         return self._source.image(self._seen(frame, "picture"))

@@ -18,7 +18,7 @@ from evsplat.export.gaussians import (
     rest_track,
     write_file,
 )
-from evsplat.export.low_pass import for_viewer
+from evsplat.export.low_pass import VIEWERS_LOW_PASS, for_viewer
 from evsplat.export.skeleton import export_motion
 from evsplat.files import refuse_existing, try_target
 from evsplat.options import ExportOptions
@@ -54,8 +54,8 @@ def export_run(
     view; in the file they are those seen from ``camera`` (default: the recording one) at that
     instant. Axes are the capture's unless ``up`` turns them; .spz and .glb are always y up.
 
-    With ``low_pass`` Gaussians are narrowed by what a viewer adds more than training did (px^2;
-    most add 0.3), at the size and the distance of that camera.
+    A viewer that adds ``low_pass`` px^2 (default: `VIEWERS_LOW_PASS`) to each Gaussian shows what
+    training saw, at the size and the distance of that camera.
 
     ``html`` is one page that plays the recording (``fps`` pictures per second) in 3D without a
     network; it needs the extra ``view``. ``avatar`` is the person for any browser, to play and to
@@ -113,7 +113,7 @@ def _export_instant(run: Run, kind: FileKind, target: Path | None, options: Expo
         )
         source = run.reconstruction.elsewhere()
         cloud = cloud_at(source, instant.camera, instant.time_us, parts or "all")
-        viewers = source.low_pass if options.low_pass is None else options.low_pass
+        viewers = VIEWERS_LOW_PASS if options.low_pass is None else options.low_pass
         cloud = for_viewer(cloud, instant.camera, source.low_pass, viewers)
         which = "" if parts in (None, "all") else f"{parts}-"
         label = f"{which}{instant.label}"

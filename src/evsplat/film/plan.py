@@ -83,6 +83,7 @@ class FilmPlan:
         elsewhere = any(camera is not recorder for camera in cameras)
         if surroundings is not None and recorder is not None and elsewhere:
             changes.append(room.soften)
+        reconstruction = reconstruction.at_any_size()
         if changes:
             reconstruction = reconstruction.elsewhere(*changes)
         cameras = _of_height(cameras, film.size)

@@ -215,12 +215,10 @@ def _filled(
 ) -> tuple[dict[str, Tensor], SolidScene | None]:
     """What the end of training decides of the person, and of the scene that one camera saw."""
     decided = filled(model, capture, config.fill, seen)
-    frames = capture.train_frames
-    several = len({frame.camera for frame in frames}) > 1
+    several = len({frame.camera for frame in capture.train_frames}) > 1
     if config.scene.kind == "random_cube" or several:
         return decided, None
-    recorded = frames[:1] if capture.is_static_camera else frames
-    cameras = [capture.camera(frame).to(model.device) for frame in recorded]
+    cameras = [camera.to(model.device) for camera in capture.recorders()]
     gaussians = model.gaussians
     name = f"gaussians.{gaussians.colour}"
     colours = decided.get(name, gaussians.get_parameter(gaussians.colour)).detach().clone()

@@ -202,8 +202,7 @@ def _scene(
 def _seen(points: Float[Tensor, "N 3"], capture: TrainingCapture) -> Tensor:
     """Points in view of a training camera, or near it: no other one would ever learn anything."""
     seen = torch.zeros(len(points), dtype=torch.bool)
-    cameras = [capture.camera(frame) for frame in capture.train_frames]
-    for camera in cameras[:1] if capture.is_static_camera else cameras:
+    for camera in capture.recorders():
         pixels, depth = camera.project(points)
         size = torch.tensor([camera.width, camera.height])
         seen |= (depth > 0.01) & ((pixels / size - 0.5).abs() < 0.6).all(-1)

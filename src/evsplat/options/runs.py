@@ -201,9 +201,9 @@ class ExportOptions:
     )
     """Turn the world so that this axis points up."""
     low_pass: Annotated[
-        float | None, Within(0, 1), option("PX2", default="what training added")
+        float | None, Within(0, 1), option("PX2", default="0.05, for those in browsers")
     ] = None
-    """Make up for a viewer that adds so many px^2, at the recording's size (docs/export.md)."""
+    """For viewers that add so many px^2 to Gaussians, at the recording's size (docs/export.md)."""
     motion: Annotated[str | None, option("NAME", default="the recorded one alone")] = None
     """Another motion for avatar, bvh or skeleton, as 'evsplat render' takes it."""
     motion_fps: MotionRate = None

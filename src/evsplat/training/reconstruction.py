@@ -17,6 +17,7 @@ from evsplat.models.drawing import SHADOW_STEP_PX, draw, draw_depth, shadowed_sc
 from evsplat.models.kept import Kept
 from evsplat.models.layers import Layers
 from evsplat.models.seen import Seen, draw_values
+from evsplat.models.smoothing import smoothed
 from evsplat.models.solid_scene import SolidScene
 from evsplat.render import Backdrop, Splats, render
 
@@ -41,6 +42,10 @@ class GaussianReconstruction:
     """What pictures of person and scene show where nothing is; black without."""
     solid: SolidScene | None = None
     """The scene as it is `elsewhere`; None where the end of training did not make one."""
+    recorders: tuple[Camera, ...] = ()
+    """Cameras that training saw through, or some of them."""
+    as_wide: bool = False
+    """Whether pictures finer than those of the recorders show Gaussians as wide as those did."""
 
     def render(self, camera: Camera, times_us: Sequence[int], *, parts: Parts = "all") -> Rendering:
         """Pictures at the given times; see `Reconstruction`.
@@ -131,6 +136,8 @@ class GaussianReconstruction:
             layers = self.posed.of(self.model.parameters(), pose, asked=times)
         for change in self.changes:
             layers = change(layers, camera)
+        if self.as_wide:
+            layers = smoothed(layers, camera, self.recorders)
         return camera, layers
 
     @property
@@ -141,7 +148,14 @@ class GaussianReconstruction:
     def following(self, track: BodyTrack) -> "GaussianReconstruction":
         """The same person and scene with the motion ``track`` (same body, own times) instead."""
         model = self.model.following(track)
-        return GaussianReconstruction(self.name, model, self.seen, solid=self.solid)
+        return GaussianReconstruction(
+            self.name,
+            model,
+            self.seen,
+            solid=self.solid,
+            recorders=self.recorders,
+            as_wide=self.as_wide,
+        )
 
     def in_new_motion(self, track: BodyTrack) -> "GaussianReconstruction":
         """As `following`, for poses that were not recorded: neighbours on the skin stay together.
@@ -158,7 +172,11 @@ class GaussianReconstruction:
         The posed Gaussians are changed by each of ``changes`` in turn before they are drawn.
         """
         solid = () if self.solid is None else (self.solid.stand_for,)
-        return replace(self, changes=solid + changes)
+        return replace(self.at_any_size(), changes=solid + changes)
+
+    def at_any_size(self) -> "GaussianReconstruction":
+        """As pictures are to show it that may be larger than the recorded ones; see `smoothed`."""
+        return replace(self, as_wide=True)
 
     @property
     def low_pass(self) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from evsplat.body import nearest_axis
+from evsplat.camera import spread_over
 from evsplat.capture import Camera, Capture, TrainingCapture, load_capture
 from evsplat.capture.masked import MaskedCapture
 from evsplat.capture.policy import Terms
@@ -343,7 +344,13 @@ def load_run(run_dir: Path | str, *, device: str = "auto", state: Path | None = 
         ),
         capture=capture,
         reconstruction=GaussianReconstruction(
-            method, composition.model, seen, Backdrop(), Kept(), solid=solid
+            method,
+            composition.model,
+            seen,
+            Backdrop(),
+            Kept(),
+            solid=solid,
+            recorders=tuple(camera.to(device) for camera in spread_over(shown.recorders())),
         ),
         device=facts["device"],
         human_only=isinstance(composition.capture, MaskedCapture),

@@ -164,7 +164,8 @@ def _cached(reconstruction: GaussianReconstruction) -> GaussianReconstruction:
     assert isinstance(reconstruction.model, nn.Module)
     model: Any = with_cached_networks(reconstruction.model)
     # No `posed`: a draft of the same times is another.
-    return replace(reconstruction, model=model, backdrop=Backdrop(), posed=None)
+    drawn = reconstruction.at_any_size()
+    return replace(drawn, model=model, backdrop=Backdrop(), posed=None)
 
 
 def load_newest(path: Path, device: str) -> Run:

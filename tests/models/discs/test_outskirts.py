@@ -164,7 +164,7 @@ def test_what_a_picture_that_is_not_drawn_shows_is_no_outside(tiny_capture, monk
     pose = recording.world_to_camera.clone()
     pose[0, 3] -= 1.2
     aside = replace(recording, world_to_camera=pose)
-    monkeypatch.setattr("evsplat.models.discs.scene_pictures.MOST_VIEWS", 2)
+    monkeypatch.setattr("evsplat.camera.MOST_VIEWS", 2)
     found = outskirts(model.gaussians, [recording, aside, recording], model.low_pass)
     alone = outskirts(model.gaussians, [recording, recording], model.low_pass)
     own = scene_of(model).channels[0, :, :3]

@@ -42,7 +42,7 @@ const fields = avatar.correctives && {
 let renderer = null;
 try {
   const linear = avatar.transfer === "linear";
-  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.light, fields, linear);
+  renderer = new SplatRenderer(canvas, clouds, joints + 1, avatar.low_pass_px2, avatar.camera, avatar.light, fields, linear);
   find("message").hidden = true;
 } catch (error) {
   find("message").textContent = error.message;

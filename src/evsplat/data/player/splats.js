@@ -29,6 +29,7 @@ uniform mat4 view;         // world to camera: x right, y down, z forward
 uniform vec4 lens;         // focal lengths and principal point, pixels
 uniform vec2 size;         // of the picture, pixels
 uniform float lowPass;     // px²
+uniform vec4 recorder;     // · (world, 1): size of the recording camera's pixels there, metres
 uniform bool lit;
 uniform vec4 room;         // middle and radius of the places that the light knows
 uniform vec3 light[36];    // of 1, x, y, z of the place, nine each, in the order of basis below
@@ -96,8 +97,10 @@ void main() {
   mat3 seen = linear * covariance * transpose(linear);
   vec3 right = vec3(focal.x, 0, -focal.x * tangent.x) / local.z;
   vec3 down = vec3(0, focal.y, -focal.y * tangent.y) / local.z;
-  float xx = dot(right, seen * right) + lowPass, xy = dot(right, seen * down);
-  float yy = dot(down, seen * down) + lowPass, determinant = xx * yy - xy * xy;
+  // Pixels that are finer than the recorded ones show Gaussians as wide as those did.
+  float finer = max(1.0, dot(recorder, vec4(world, 1)) * focal.x / local.z), widened = lowPass * finer * finer;
+  float xx = dot(right, seen * right) + widened, xy = dot(right, seen * down);
+  float yy = dot(down, seen * down) + widened, determinant = xx * yy - xy * xy;
   if (determinant <= 0.0) return;
 
   conic = vec3(yy, -xy, xx) / determinant;
@@ -142,16 +145,18 @@ void main() {
 
 class SplatRenderer {
   // clouds: lists of rows (centre, rotation wxyz, scales, opacity, RGB) with skins (bones, weights and
-  // factors on the scales, as many of each cloud) and, where light falls on them, normals. lowPass: px². light: center, radius_m,
-  // coefficients (4 x 9 x 3), lamps and their intensities (L x 3), or null. correctives: count of
-  // fields, steps and values (count x Gaussians x 4) for the first cloud, or null. linear: RGB are light.
-  constructor(canvas, clouds, boneCount, lowPass, light, correctives, linear) {
+  // factors on the scales, as many of each cloud) and, where light falls on them, normals. lowPass:
+  // px² of the camera recorder. light: center, radius_m, coefficients (4 x 9 x 3), lamps and their
+  // intensities (L x 3), or null. correctives: count of fields, steps and values (count x Gaussians x 4)
+  // for the first cloud, or null. linear: RGB are light.
+  constructor(canvas, clouds, boneCount, lowPass, recorder, light, correctives, linear) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!gl) throw new Error("This browser has no WebGL 2, which drawing Gaussians needs.");
     this.gl = gl;
     this.canvas = canvas;
     this.boneCount = boneCount;
     this.lowPass = lowPass;
+    this.recorder = recorder.world_to_camera[2].map((value) => value / recorder.K[0][0]);
     this.light = light;
     this.linear = linear;
     // Sixteen bits per channel where the device can blend them: eight add a rounding per Gaussian.
@@ -282,6 +287,7 @@ class SplatRenderer {
     gl.uniform4fv(gl.getUniformLocation(this.program, "lens"), lens);
     gl.uniform2f(gl.getUniformLocation(this.program, "size"), width, height);
     gl.uniform1f(gl.getUniformLocation(this.program, "lowPass"), this.lowPass);
+    gl.uniform4fv(gl.getUniformLocation(this.program, "recorder"), this.recorder);
     gl.uniform1i(gl.getUniformLocation(this.program, "lit"), this.light ? 1 : 0);
     if (this.light) {
       const { center, radius_m, coefficients, lamps, intensities } = this.light;

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.camera import Camera
+from evsplat.camera import Camera, spread_over
 from evsplat.gaussians import GaussianSet
 from evsplat.gaussians.surround import cell_px, continued
-from evsplat.models.discs.scene_pictures import SEEN, ScenePictures, spread_over
+from evsplat.models.discs.scene_pictures import SEEN, ScenePictures
 from evsplat.neighbours import nearest
 
 STEPS = 16

@@ -18,19 +18,11 @@ from evsplat.models.discs.still import Still
 from evsplat.models.seen import fixed, shares_by, transposed
 from evsplat.render import render
 
-MOST_VIEWS = 12
-"""Pictures of a moving camera that are drawn."""
 SEEN = 0.1
 """Squared shares of pixels from which on a Gaussian is seen."""
 _FAST = 1e6
 _FARTHER = 1.15
 """Least depth of what is hidden as a share of the picture's there."""
-
-
-def spread_over(recorded: Sequence[Camera]) -> list[Camera]:
-    """At most `MOST_VIEWS` of the cameras, evenly."""
-    drawn = torch.linspace(0, len(recorded) - 1, min(MOST_VIEWS, len(recorded))).round().int()
-    return [recorded[index] for index in drawn.tolist()]
 
 
 class ScenePictures:

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from evsplat.camera import Camera
+from evsplat.camera import Camera, spread_over
 from evsplat.gaussians import Adam, GaussianSet
-from evsplat.models.discs.scene_pictures import SEEN, ScenePictures, spread_over
+from evsplat.models.discs.scene_pictures import SEEN, ScenePictures
 from evsplat.models.layers import scene_splats
 from evsplat.models.solid_scene import SolidScene
 from evsplat.render import render
