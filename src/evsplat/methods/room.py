@@ -208,13 +208,12 @@ class _Surfaces:
     def cheapest(self, nearest_m: Sequence[float]) -> list[float]:
         """Distances of the three walls from the camera, metres; infinite where there is none.
 
-        None is less than ``nearest_m``. Each is chosen while the others stay, in turns, begun from
-        every third distance of the wall ahead.
+        None is less than ``nearest_m``. Each is chosen while the others stay, in turns, the wall
+        ahead first and without walls at the sides.
         """
         ahead, *sides = map(_distances, nearest_m, _FARTHEST)
         tried = [ahead, *([math.inf, *side] for side in sides)]
-        ends = (self._settled([first, math.inf, math.inf], tried) for first in ahead[::3])
-        best = min(ends, key=self.price)
+        best = self._settled([math.inf] * 3, tried)
         return self._settled(best, [_around(*pair) for pair in zip(best, tried, strict=True)])
 
     def at_the_foot(
