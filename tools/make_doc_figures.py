@@ -18,6 +18,7 @@ EXPOSURE = 4
 """Frame through whose exposure the strip goes."""
 GAP_PX = 4
 DEMO_PX = 400
+FILM_PX = 360
 
 
 def strip(run: Path, name: str, count: int, **film: object) -> list[Image.Image]:
@@ -96,7 +97,10 @@ def main(run: Path) -> None:
         in_place=True,
         seconds=2.0,
         fps=12.0,
+        size=FILM_PX,
     )
+    around = {"motion": "spin", "path": "orbit", "fps": 12.0}
+    render_run(run, out=OUT / "film.webp", size=FILM_PX, **around)
 
 
 if __name__ == "__main__":
