@@ -1,11 +1,14 @@
 """The page that plays: what viser is given."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from evsplat.export import clip, export_run
+from evsplat.export.cloud import cloud_of
+from evsplat.models.smoothing import widened
 
 from .clouds import covariances, random_cloud
 
@@ -15,6 +18,8 @@ pytestmark = pytest.mark.filterwarnings("error::DeprecationWarning")
 
 
 def test_the_recording_becomes_one_page(run, monkeypatch, capfd):
+    recorder = run.capture.camera(run.capture.frames[5])
+    run.reconstruction = replace(run.reconstruction, recorders=(recorder,))
     shown = []
     show = clip._show
 
@@ -41,6 +46,12 @@ def test_the_recording_becomes_one_page(run, monkeypatch, capfd):
     for time, (_, cloud) in zip(times, shown[1:], strict=True):
         (person,) = run.reconstruction.splats(camera, [time], parts="human")
         np.testing.assert_allclose(cloud.means, person.means[0].detach(), atol=1e-6)
+        # As wide as in the recorded picture, of which a pixel is many of the window's.
+        factor = 720 / camera.height
+        larger = camera.resized(round(factor * camera.width), 720)
+        wide = widened(person, run.reconstruction.low_pass, larger, [camera])
+        np.testing.assert_allclose(cloud.scales, cloud_of(wide).scales, rtol=1e-4)
+        assert (cloud.scales > cloud_of(person).scales).all()
     text = page.read_text(encoding="utf-8")
     (data,) = re.findall(r'__VISER_EMBED_DATA__="([^"]*)"', text)
     assert len(data) > 10_000

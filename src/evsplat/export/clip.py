@@ -26,6 +26,8 @@ logger = logging.getLogger(__name__)
 _ENLARGED = 32.0
 """viser keeps covariances in 16 bits, too few for square metres of millimetre-sized Gaussians: they
 are stored 32 times as large, and the scene is shrunk."""
+_WINDOW_PX = 720
+"""Pictures of a window so high show Gaussians as wide as training saw them."""
 
 
 def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: float) -> Path:
@@ -40,7 +42,7 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         raise ConfigError(
             "An html clip needs the package viser; get it with: pip install 'evsplat[view]'."
         ) from None
-    capture, source = run.capture, run.reconstruction
+    capture, source = run.capture, run.reconstruction.at_any_size()
     track = load_body_track(capture)
     transfer = capture.transfer(capture.frames[0])
     middle = instant_of(capture, time_s=None, frame=None, camera=camera)
@@ -49,11 +51,13 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
     times = [mids[0] + round(k * 1e6 / fps) for k in range(count)]
     with contextlib.redirect_stdout(io.StringIO()):  # viser's address, at which nobody looks
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    view = middle.camera
+    factor = max(1.0, _WINDOW_PX / view.height)
+    window = view.resized(round(factor * view.width), round(factor * view.height))
     try:
         server.gui.configure_theme(dark_mode=True)
         server.gui.main_panel.dock_right()
         server.scene.set_up_direction(tuple(up_axis(track).tolist()))
-        view = middle.camera
         # The reader orbits about a place as far as the person.
         away = view.project(track.vertices(middle.time_us))[1].mean()
         ahead = view.center() + view.world_to_camera[2, :3] * away
@@ -61,13 +65,13 @@ def export_clip(run: Run, path: Path, parts: Parts, camera: str | None, fps: flo
         server.initial_camera.look_at = tuple(ahead.tolist())
         server.initial_camera.fov = 2 * math.atan(view.height / 2 / float(view.K[1, 1]))
         if parts != "human":
-            layers = source.elsewhere().splats(middle.camera, [middle.time_us], parts=parts)
+            layers = source.elsewhere().splats(window, [middle.time_us], parts=parts)
             _show(server, "/scene", cloud_of(layers[-1]).shown(transfer))
         serializer = server.get_scene_serializer()
         handle = None
         for time in tqdm(times if parts != "scene" else times[:1], desc="clip", unit="picture"):
             if parts != "scene":
-                layers = source.splats(middle.camera, [time], parts="human")
+                layers = source.splats(window, [time], parts="human")
                 person = cloud_of(layers[0]).shown(transfer)
                 handle = _show(server, "/person", person, handle)
             serializer.insert_sleep(1 / fps)
