@@ -121,6 +121,18 @@ def test_dat_of_the_first_version_is_refused(tmp_path: Path) -> None:
         open_recording(tmp_path / "e.dat")
 
 
+def test_dat_that_does_not_say_its_version_is_read_with_a_note(tmp_path: Path) -> None:
+    """Metavision's description has that line as mandatory; older files of version 1 lack it too."""
+    s = random_stream(14, 50)
+    data = encoders.dat(s)
+    (tmp_path / "e.dat").write_bytes(data.replace(b"% Version 2\n", b""))
+    recording = open_recording(tmp_path / "e.dat")
+    assert same(recording.read(), s)
+    assert ["read as version 2 of DAT" in note for note in recording.notes] == [True]
+    (tmp_path / "e.dat").write_bytes(data)
+    assert not open_recording(tmp_path / "e.dat").notes
+
+
 def test_dvs128_has_the_polarity_of_jaer(tmp_path: Path) -> None:
     s = random_stream(11, 100)
     s = EventStream(s.t, s.x % 128, s.y % 128, s.p)
@@ -159,6 +171,28 @@ def test_a_frame_with_a_time_and_a_length_alone_is_exposed_from_that_time_on(
     path = tmp_path / "e.aedat4"
     path.write_bytes(data + struct.pack("<ii", 1, len(frame)) + frame)
     assert [read.exposure_us for read in open_recording(path).frames()] == [(5_000, 25_000)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "pixels"),
+    [(2, "CV_16UC1", 96), (18, "CV_16UC3", 288), (5, "CV_32FC1", 192), (8, "CV_8UC2", 96)],
+)
+@pytest.mark.parametrize("repair", [False, True])
+def test_pixels_that_are_not_read_are_named(
+    tmp_path: Path, kind: int, name: str, pixels: int, repair: bool
+) -> None:
+    """The packets were called damaged, and --repair left all of them out."""
+    fields = {5: bytes([kind]), 6: struct.pack("<h", 8), 7: struct.pack("<h", 6)}
+    frame = encoders.flatbuffer(fields, {10: (pixels, bytes(pixels))}, b"FRME")
+    data = encoders.aedat4(random_stream(12, 50), WIDTH, HEIGHT, compression=0)
+    path = tmp_path / "e.aedat4"
+    path.write_bytes(data + struct.pack("<ii", 1, len(frame)) + frame)
+    with pytest.raises(DataError, match=f"of OpenCV's type {name}, expected 8 bits with 1, 3 or"):
+        list(open_recording(path, repair=repair).frames())
+    short = encoders.flatbuffer(fields, {10: (pixels - 1, bytes(pixels - 1))}, b"FRME")
+    path.write_bytes(data + struct.pack("<ii", 1, len(short)) + short)
+    with pytest.raises(DataError, match=f"is damaged .pixel type {kind}, expected 8 bits"):
+        list(open_recording(path).frames())
 
 
 def _described(*streams: tuple[str, str]) -> str:
@@ -265,6 +299,22 @@ def test_of_two_cameras_in_aedat3_one_gives_size_events_and_frames(
     assert (recording.width, recording.height) == (240, 180)
     assert same(recording.read(), s)
     assert [int(frame.image[0, 0]) for frame in recording.frames()] == [200]
+    assert any("only events of source 1 are read" in note for note in recording.notes)
+
+
+def test_of_two_cameras_in_aedat3_events_are_of_that_with_frames(tmp_path: Path) -> None:
+    """Events of a camera without frames came with frames of the other."""
+    bare, framed = random_stream(33, 300), random_stream(34, 200)
+    end = b"#!END-HEADER\r\n"
+    first = encoders.aedat3(bare, WIDTH, HEIGHT, sensor="DVXPLORER", source=0)
+    first = first[: first.rindex(encoders.aedat3_frame_info(1)) - 28]
+    second = encoders.aedat3(framed, WIDTH, HEIGHT, AEDAT3_FRAMES[:1], sensor="DAVIS346")
+    header, packets = first.split(end, 1)
+    path = tmp_path / "two.aedat"
+    path.write_bytes(header + b"#Source 1: DAVIS346\r\n" + end + packets + second.split(end, 1)[1])
+    recording = open_recording(path)
+    assert same(recording.read(), framed)
+    assert [frame.exposure_us for frame in recording.frames()] == [(1_000, 9_000)]
     assert any("only events of source 1 are read" in note for note in recording.notes)
 
 

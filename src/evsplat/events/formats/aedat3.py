@@ -50,9 +50,9 @@ _CHANNELS = (1, 3, 4)
 
 
 class Aedat3(Source):
-    """An AEDAT 3.1 file; the events of the first source that has any, and its frames.
+    """An AEDAT 3.1 file; the events of a source that has frames as well, where one has, and those.
 
-    Where that one has no frames they are those of the first source that has.
+    Else the events and the frames of the first source that has any.
     """
 
     def read_header(self, options: ReadOptions) -> None:
@@ -65,9 +65,12 @@ class Aedat3(Source):
                 f"{self.path}: its packets are packed ({packing}), expected '#Format: RAW'; "
                 "write it as AEDAT4 with DV, or record without compression."
             )
-        first_events = next(self._packets(_POLARITY, Damage(self.path, repair=True)), None)
-        self._source = None if first_events is None else int(first_events[1]["source"])
-        name = self._sensor(lines)
+        names = _sensors(lines)
+        self._source = source = self._first(_POLARITY)
+        if len(names) > 1 and source is not None and self._first(_FRAME, source) is None:
+            both = (n for n in names if self._first(_FRAME, n) == self._first(_POLARITY, n) == n)
+            self._source = next(both, source)
+        name = self._sensor(names)
         self.width, self.height = next(
             (size for chip, size in _SIZES.items() if name.startswith(chip)), (None, None)
         )
@@ -84,7 +87,7 @@ class Aedat3(Source):
 
     def blocks(self) -> Iterator[RawEvents]:
         """Packets of polarity events, without those that were marked as invalid."""
-        for offset, head, body in self._packets(_POLARITY, self.damage):
+        for offset, head, body in self._packets(_POLARITY, self.damage, self._source):
             if head["size"] != _EVENT.itemsize:
                 _broken(self.damage, offset, f"its events have {head['size']} bytes")
                 continue
@@ -161,10 +164,13 @@ class Aedat3(Source):
             f"{self.path}: its AEDAT 3.1 header has no line {_END.decode()}; copy it again."
         )
 
-    def _sensor(self, lines: list[str]) -> str:
+    def _first(self, kind: int, source: int | None = None) -> int | None:
+        """The source of the first packet of a kind; None where there is none."""
+        packet = next(self._packets(kind, Damage(self.path, repair=True), source), None)
+        return None if packet is None else int(packet[1]["source"])
+
+    def _sensor(self, names: dict[int, str]) -> str:
         """Name of the sensor whose events are read, in small letters; empty where none is named."""
-        found = (re.fullmatch(r"#\s*Source (\d+): *(.*)", line) for line in lines)
-        names = {int(match[1]): match[2].strip() for match in found if match}
         if len(names) > 1 and self._source is not None:
             listed = ", ".join(f"{number} ({name})" for number, name in names.items())
             self.notes.append(f"sources {listed}: only events of source {self._source} are read")
@@ -204,6 +210,12 @@ class Aedat3(Source):
                     repaired_by="keeps the packets before the cut",
                 )
                 return
+
+
+def _sensors(lines: list[str]) -> dict[int, str]:
+    """Source to the name of its sensor."""
+    found = (re.fullmatch(r"#\s*Source (\d+): *(.*)", line) for line in lines)
+    return {int(match[1]): match[2].strip() for match in found if match}
 
 
 def _value(lines: list[str], key: str) -> str | None:

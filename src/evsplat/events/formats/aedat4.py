@@ -41,6 +41,8 @@ _EVENT = np.dtype(
 )
 # OpenCV's type numbers -> channels
 _PICTURE_CHANNELS = {0: 1, 16: 3, 24: 4}
+_DEPTHS = ("8U", "8S", "16U", "16S", "32S", "32F", "64F", "16F")
+"""OpenCV's words for the lowest three bits of a type number; above them are the channels."""
 
 
 class _Stream(NamedTuple):
@@ -94,7 +96,7 @@ class Aedat4(Source):
             return
         for offset, data in self._packets(self._frames, b"FRME"):
             try:
-                frame = _frame(_Table.root(data, 4))
+                frame = _frame(self.path, _Table.root(data, 4))
             except (_FlatbufferError, ValueError) as error:
                 self._broken(offset, str(error))
                 continue
@@ -190,7 +192,7 @@ class Aedat4(Source):
         )
 
 
-def _frame(table: "_Table") -> RecordedFrame:
+def _frame(path: Path, table: "_Table") -> RecordedFrame:
     start, end = table.integer(3, "q"), table.integer(4, "q")
     if not start and not end:
         # dv-processing reads such a frame as well: its time is the start of its exposure
@@ -200,7 +202,14 @@ def _frame(table: "_Table") -> RecordedFrame:
     pixels = np.frombuffer(table.vector(10, 1), dtype=np.uint8)
     channels = _PICTURE_CHANNELS.get(kind)
     if channels is None:
-        raise ValueError(f"pixel type {kind}, expected 8 bits with 1, 3 or 4 channels")
+        depth, of_type = _DEPTHS[kind & 7], (kind >> 3) + 1
+        expected = "expected 8 bits with 1, 3 or 4 channels (CV_8UC1, CV_8UC3, CV_8UC4)"
+        if pixels.size == width * height * of_type * int(depth[:-1]) // 8 > 0:
+            raise DataError(
+                f"{path}: its frames have pixels of OpenCV's type CV_{depth}C{of_type}, "
+                f"{expected}; write them so, or give them as pictures to 'evsplat import folder'."
+            )
+        raise ValueError(f"pixel type {kind}, {expected}")
     if width <= 0 or height <= 0 or pixels.size != width * height * channels or end < start:
         raise ValueError(
             f"a frame of {width}x{height}x{channels} with {pixels.size} bytes, exposed from "

@@ -142,7 +142,13 @@ class Dat(Source):
                 f"{self.path}: after its header come bytes {kind.hex(' ') or 'none'}, expected an "
                 "event type of 0 or 12 and a size of 8."
             )
-        version = header.values.get("version", _DAT_VERSION)
+        version = header.values.get("version")
+        if version is None:
+            version = _DAT_VERSION
+            self.notes.append(
+                "its header has no line of its version: read as version 2 of DAT, which Metavision "
+                "writes; of version 1 pixels come out at wrong places"
+            )
         if version != _DAT_VERSION:
             raise DataError(
                 f"{self.path}: its header says version {version} of DAT, whose pixels are laid out "
