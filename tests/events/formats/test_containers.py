@@ -92,6 +92,36 @@ def test_hdf5_layouts_give_the_same_events(
     assert (recording.width, recording.height) == ((320, 240) if known else (None, None))
 
 
+@pytest.mark.parametrize(
+    ("said", "per_us"), [("s", 1e-6), ("Milliseconds", 1e-3), (b"us", 1), ("ns", 1000)]
+)
+@pytest.mark.parametrize("compound", [False, True])
+def test_the_unit_that_times_are_said_to_have_is_theirs(
+    tmp_path: Path, said: str | bytes, per_us: float, compound: bool
+) -> None:
+    """Whole milliseconds were read as microseconds, whatever the attribute said."""
+    s = random_stream(26, 400, first_us=5_000)
+    s = EventStream(s.t // 1000 * 1000, s.x, s.y, s.p)
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        columns = {"t": s.t * per_us, "x": s.x, "y": s.y, "p": s.p}
+        if compound:
+            kind = [("t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "i1")]
+            file["events"] = np.array(list(zip(*columns.values(), strict=True)), dtype=kind)
+        else:
+            for name, values in columns.items():
+                file[f"events/{name}"] = values
+        name = "events" if compound else "events/t"
+        file[name].attrs["unit"] = said
+    assert same(read_events(tmp_path / "e.h5"), s)
+    with h5py.File(tmp_path / "e.h5", "a") as file:
+        file[name].attrs["unit"] = "ticks"
+    with pytest.raises(
+        DataError, match=f"attribute unit of /{name} is 'ticks', expected s, ms, us or ns"
+    ):
+        open_recording(tmp_path / "e.h5")
+    assert len(read_events(tmp_path / "e.h5", time_unit="us")) == len(s)
+
+
 def test_named_datasets(tmp_path: Path) -> None:
     s = random_stream(22, 100)
     with h5py.File(tmp_path / "e.h5", "w") as file:
@@ -240,7 +270,9 @@ def test_ros2_folder_and_single_file(tmp_path: Path, storage: StoragePlugin, pac
         for number, message in enumerate(messages):
             bag.write(topic, number + 1, store.serialize_cdr(message, kind))
     single = next(p for p in (tmp_path / "bag").iterdir() if p.suffix in (".db3", ".mcap"))
-    for path in (tmp_path / "bag", single):
+    renamed = tmp_path / "events.recorded"  # the first bytes decide, never the name
+    shutil.copy(single, renamed)
+    for path in (tmp_path / "bag", single, renamed):
         recording = open_recording(path)
         assert (recording.format, recording.width, recording.height) == ("rosbag", WIDTH, HEIGHT)
         assert same(recording.read(), s)

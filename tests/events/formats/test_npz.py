@@ -3,6 +3,7 @@
 import gzip
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -82,6 +83,29 @@ def test_ambiguous_table_asks_for_columns(tmp_path: Path) -> None:
         open_recording(tmp_path / "e.npy")
     read = read_events(tmp_path / "e.npy", columns="t,x,y,p")
     assert read.t.tolist() == [1, 2] and read.p.tolist() == [1, -1]
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".csv", ".h5"])
+def test_the_order_that_is_taken_of_columns_without_names_is_told(
+    tmp_path: Path, suffix: str
+) -> None:
+    """Of t, y, x, p the x and y were exchanged without a word."""
+    s = random_stream(7, 300)
+    table = np.stack([s.t, s.y, s.x, s.p], axis=1)
+    path = tmp_path / f"e{suffix}"
+    if suffix == ".npy":
+        np.save(path, table)
+    elif suffix == ".csv":
+        np.savetxt(path, table, fmt="%d", delimiter=",")
+    else:
+        with h5py.File(path, "w") as file:
+            file["events"] = table
+    notes = open_recording(path, width=WIDTH, height=WIDTH).notes
+    assert [note for note in notes if "taken for t,x,y,p; if they are not" in note]
+    with pytest.raises(DataError, match="are of no known order; say which is which"):
+        open_recording(path, width=WIDTH, height=240)
+    told = open_recording(path, columns="t,y,x,p", width=WIDTH, height=240)
+    assert same(told.read(), s) and not told.notes
 
 
 def test_pickles_are_refused(tmp_path: Path) -> None:

@@ -15,13 +15,21 @@ import numpy as np
 from evsplat.errors import DataError
 from evsplat.events.formats.base import (
     BLOCK_EVENTS,
+    SAY_UNIT,
     RawEvents,
     Source,
 )
-from evsplat.events.formats.table import NO_POLARITY, Table, match_names, table_order
+from evsplat.events.formats.table import (
+    NO_POLARITY,
+    Table,
+    assumed_order,
+    match_names,
+    table_order,
+    unit_called,
+)
 from evsplat.events.hdf5_output import has_only_darker
 from evsplat.options import ReadOptions
-from evsplat.untrusted.faults import broken_as
+from evsplat.untrusted.faults import brief, broken_as
 from evsplat.untrusted.hdf5 import data_set, holds, open_hdf5, wrong_data_set
 
 _PLACES = ("events", "CD/events", "/")
@@ -57,12 +65,16 @@ class Hdf5(Source):
             if abs(self._offset_us) > 1 << 60:
                 raise DataError(f"{self.path}: t_offset is {self._offset_us} us, which is no time.")
             self.width, self.height = _size(file)
-            head = Table(self.path, self._slice(file, 0), options.time_unit)
+            unit = options.time_unit or _unit(self.path, file[self._columns["t"].dataset])
+            head = Table(self.path, self._slice(file, 0), unit)
             self._unit = head.unit
             self.has_polarity = head.has_polarity or self._any_polarity(file)
         self.notes = [note for note in head.notes if note != NO_POLARITY]
         if not self.has_polarity and "p" in self._columns:
             self.notes.append(NO_POLARITY)
+        places = {name: c.index for name, c in self._columns.items() if c.index is not None}
+        if places and not isinstance(options.columns, tuple):
+            self.notes.append(assumed_order(sorted(places, key=places.__getitem__)))
 
     def blocks(self) -> Iterator[RawEvents]:
         """Slices of the columns."""
@@ -206,6 +218,23 @@ def _check_filters(path: Path, dataset: h5py.Dataset) -> None:
                 f"{path}: packed with HDF5 filter {others[0]}; pip install 'evsplat[recordings]' "
                 "to read it."
             ) from None
+
+
+def _unit(path: Path, times: h5py.Dataset) -> str | None:
+    """Unit of the times, where an attribute of theirs says."""
+    for name in ("unit", "units"):
+        if name not in times.attrs:
+            continue
+        said = times.attrs[name]
+        word = said.decode("latin-1") if isinstance(said, bytes) else said
+        unit = unit_called(word.strip().lower()) if isinstance(word, str) else None
+        if unit is not None:
+            return unit
+        raise DataError(
+            f"{path}: attribute {name} of {times.name} is {brief(said)}, expected s, ms, us or ns; "
+            f"correct it, or give the unit with {SAY_UNIT}."
+        )
+    return None
 
 
 def _size(file: h5py.File) -> tuple[int | None, int | None]:

@@ -12,7 +12,7 @@ from evsplat.events.formats.base import (
     RawEvents,
     Source,
 )
-from evsplat.events.formats.table import NAMES, Table, match_names, table_order
+from evsplat.events.formats.table import NAMES, Table, assumed_order, match_names, table_order
 from evsplat.options import ReadOptions
 from evsplat.untrusted.arrays import read_plain_arrays
 from evsplat.untrusted.faults import brief
@@ -26,10 +26,10 @@ class Npz(Source):
     def read_header(self, options: ReadOptions) -> None:
         """See `Source`."""
         arrays = read_plain_arrays(self.path)
-        named = _components(self.path, arrays, options)
+        named = _components(self.path, arrays, options, self.notes)
         self._table = Table(self.path, named, options.time_unit)
         self.has_polarity = self._table.has_polarity
-        self.notes = self._table.notes
+        self.notes += self._table.notes
         for wide, high in _SIZE_KEYS:
             if all(key in arrays and arrays[key].size == 1 for key in (wide, high)):
                 self.width, self.height = (
@@ -54,9 +54,9 @@ def _pixels(path: Path, key: str, array: np.ndarray) -> int:
 
 
 def _components(
-    path: Path, arrays: dict[str, np.ndarray], options: ReadOptions
+    path: Path, arrays: dict[str, np.ndarray], options: ReadOptions, notes: list[str]
 ) -> dict[str, np.ndarray]:
-    """t, x, y and, where there is one, p."""
+    """t, x, y and, where there is one, p; ``notes`` get what was assumed."""
     columns = options.columns
     if isinstance(columns, Mapping):
         missing = sorted(set(columns.values()) - set(arrays))
@@ -76,6 +76,8 @@ def _components(
         return found
     if len(tables) == 1 and not found:
         order = columns if isinstance(columns, tuple) else table_order(path, tables[0], options)
+        if columns is None:
+            notes.append(assumed_order(order))
         if len(order) != tables[0].shape[1]:
             raise DataError(
                 f"{path}: its table has {tables[0].shape[1]} columns, --columns names {len(order)}."

@@ -21,6 +21,7 @@ from evsplat.options import ReadOptions
 from evsplat.wording import counted
 
 ROS1_MAGIC = b"#ROSBAG V2.0"
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ARRAY_TYPES = ("dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray")
 _PACKET_TYPES = ("event_camera_msgs/msg/EventPacket", "event_array_msgs/msg/EventArray")
 _ENCODING = "evt3"
@@ -233,8 +234,13 @@ def _opened(path: Path) -> Iterator[Any]:
     except ImportError:
         raise DataError(f"{path}: to read ROS bags, pip install 'evsplat[recordings]'.") from None
     try:
-        is_ros1 = path.is_file() and peek(path, len(ROS1_MAGIC)) == ROS1_MAGIC
-        with (rosbag1 if is_ros1 else rosbag2).Reader(path) as bag:
+        head = peek(path, len(ROS1_MAGIC)) if path.is_file() else b""
+        reader: Any = rosbag1.Reader if head == ROS1_MAGIC else rosbag2.Reader
+        if head and reader is rosbag2.Reader:  # which goes by the suffix
+            plugins = rosbag2.Reader.STORAGE_PLUGINS
+            plugin = plugins[".mcap" if head.startswith(_MCAP_MAGIC) else ".db3"]
+            reader = type("_", (reader,), {"STORAGE_PLUGINS": {path.suffix: plugin}})
+        with reader(path) as bag:
             yield bag
     except (DataError, GeneratorExit):
         raise

@@ -16,6 +16,7 @@ NAMES = {
     "p": ("p", "ps", "pol", "pols", "polarity", "polarities", "on", "is_increase", "pE"),
 }
 _PER_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+_UNIT_WORDS = {"s": "second", "ms": "millisecond", "us": "microsecond", "ns": "nanosecond"}
 _MAX_SECONDS = 1e10
 # uint64 above 2**63 and wrong units end here, before they are cast
 _MAX_TIME_US = float(1 << 60)
@@ -140,6 +141,20 @@ def names_pixels(given: Iterable[str]) -> bool:
 def assumed_unit(unit: str) -> str:
     """The note that times are read in a unit that the file does not tell."""
     return f"times are taken for {unit}; if they are not, write the file anew with {SAY_UNIT}"
+
+
+def assumed_order(order: Iterable[str]) -> str:
+    """The note that columns are read in an order in which x and y may be exchanged."""
+    return (
+        f"columns without names are taken for {','.join(order)}; if they are not, say which is "
+        f"which with {SAY_COLUMNS}"
+    )
+
+
+def unit_called(word: str) -> str | None:
+    """The time unit of a name or a sign; None where it is another."""
+    fits = (unit for unit, name in _UNIT_WORDS.items() if word in (unit, name, f"{name}s"))
+    return next(fits, None)
 
 
 def guess_time_unit(t: np.ndarray) -> str:

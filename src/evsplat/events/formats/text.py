@@ -16,6 +16,7 @@ from evsplat.events.formats.base import (
 )
 from evsplat.events.formats.table import (
     NO_POLARITY,
+    assumed_order,
     assumed_unit,
     guess_time_unit,
     match_names,
@@ -102,6 +103,7 @@ class Text(Source):
             given = _MMHPSD_COLUMNS
         if given is None:
             given = tuple(table_order(self.path, file.sample, options))
+            self.notes.append(assumed_order(given))
         if not isinstance(given, tuple) or len(given) != file.fields:
             raise DataError(
                 f"{self.path}: has {file.fields} columns and --columns names {len(given)}; give "
