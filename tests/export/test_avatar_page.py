@@ -41,12 +41,13 @@ _SHOT = """
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="needs Chromium to show the page")
 
 
-def _said_by_browser(page, script: str, folder) -> str:
+def _said_by_browser(page, script: str, folder, *more: str) -> str:
     """What a script returns that runs in the page, once the page has started."""
     text = page.read_text(encoding="utf-8")
     probe = folder / "probe.html"
     probe.write_text(text.replace("</html>", _PROBE.replace("SCRIPT", script)), encoding="utf-8")
-    command = [BROWSER, *_ARGUMENTS, f"--user-data-dir={folder / 'profile'}", probe.as_uri()]
+    profile = f"--user-data-dir={folder / 'profile'}"
+    command = [BROWSER, *_ARGUMENTS, *more, profile, probe.as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
     return done.stdout.partition('<pre id="said">')[2].partition("</pre>")[0]
 
@@ -86,6 +87,17 @@ def test_the_page_shows_what_our_rasteriser_draws(run, tmp_path, transfer, times
     assert want.std() > 0.05
     # Half floats and eight bits; a picture that is not coded is below 20 dB.
     assert psnr(got, want) > 45
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    ("size", "is_open"), [("640,420", "false"), ("1280,800", "true"), ("520,900", "false")]
+)
+def test_the_panel_is_open_where_it_does_not_hide_the_person(run, tmp_path, size, is_open):
+    """In a window of 640 x 420 it lay over the person from all sides but the first."""
+    page = export_run(run.path, "avatar", out=tmp_path / "dancer.html")
+    script = 'return document.getElementById("fold").getAttribute("aria-expanded");'
+    assert _said_by_browser(page, script, tmp_path, f"--window-size={size}") == is_open
 
 
 @needs_browser

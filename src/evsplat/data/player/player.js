@@ -172,7 +172,9 @@ for (const slider of document.querySelectorAll("[data-axis]")) {
   };
 }
 
-find("fold").setAttribute("aria-expanded", String(innerWidth > 560));
+// Open only where it leaves the middle of the picture, in which the person is from all sides.
+const beside = find("pose").offsetLeft - innerWidth / 2;
+find("fold").setAttribute("aria-expanded", String(beside > innerHeight / 4));
 
 let before = performance.now();
 function frame(now) {
