@@ -1,5 +1,7 @@
 """What lies over and beside a drawn picture in the viewer, and where."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -8,6 +10,7 @@ pytest.importorskip("viser", reason="needs the extra view: pip install 'evsplat[
 
 from evsplat.capture import Capture, load_capture  # noqa: E402
 from evsplat.events.maps import count_map  # noqa: E402
+from evsplat.view import compositor  # noqa: E402
 from evsplat.view.camera import BrowserCamera  # noqa: E402
 from evsplat.view.compositor import INSET_SHARE, Compositor  # noqa: E402
 from evsplat.view.request import BLURRY, SHARP, Motion, ViewRequest  # noqa: E402
@@ -95,6 +98,23 @@ def test_a_recorded_picture_fills_its_box_left_of_the_divider(capture, compare: 
     assert (shown[LABEL:, 71:73] == 1).all() and (shown[LABEL:, :16] == 0).all()
     assert shown[LABEL:, 73:144] == pytest.approx(0.5, abs=1 / 255)
     assert shown[LABEL:, 144:] == pytest.approx(0.5 * 0.45, abs=1 / 255)
+
+
+def test_a_blurry_picture_in_the_place_of_a_sharp_one_is_named_as_such(
+    tiny_capture, monkeypatch
+) -> None:
+    """Of frames without a sharp truth it was shown under that name."""
+    path = tiny_capture()
+    document = json.loads((path / "capture.json").read_text())
+    del document["frames"][5]["sharp"]
+    (path / "capture.json").write_text(json.dumps(document))
+    capture, named = load_capture(path), []
+    monkeypatch.setattr(
+        compositor, "with_labels", lambda pixels, labels: named.append(labels[0][1]) or pixels
+    )
+    for frame in capture.frames[4:6]:
+        _composed(capture, ViewRequest(160, 96, BROWSER, frame.mid_us, "main", compare=SHARP))
+    assert named == [SHARP, f"{BLURRY}, no {SHARP}"]
 
 
 def test_another_run_is_left_of_the_divider_or_beside_it(capture) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw
 
 from evsplat.camera import Camera
-from evsplat.capture import Capture
+from evsplat.capture import Capture, Frame
 from evsplat.events.maps import count_map
 from evsplat.inspection.drawing import BRIGHTER, DARKER, font
 from evsplat.methods.trivial import nearest_in_time
@@ -63,7 +63,10 @@ class Compositor:
                 picture[:, left.shape[1] - 1 : left.shape[1] + 1] = 1
             else:
                 picture = divided(left, picture, request.divider)
-            labels = [(0.0, other), (0.5 if beside else request.divider, self.viewed.name)]
+            labels = [
+                (0.0, self._named(other, request)),
+                (0.5 if beside else request.divider, self.viewed.name),
+            ]
         if pane.box is None and (request.events_us is not None or request.compare != other):
             self._add_inset(picture, request)
         return with_labels((picture.clip(0, 1) * 255 + 0.5).astype(np.uint8), labels)
@@ -120,6 +123,11 @@ class Compositor:
         paste(picture, recorded, pane.box)
         return picture
 
+    def _named(self, other: str, request: ViewRequest) -> str:
+        """What is compared, by its name; of frames without a sharp truth that is the blurry one."""
+        instead = other == SHARP and self._recorded_frame(request).sharp is None
+        return f"{BLURRY}, no {SHARP}" if instead else other
+
     def _add_inset(self, picture: Picture, request: ViewRequest) -> None:
         """Put the recorded picture, with its events, into the lower left corner."""
         recorded = self._recorded(request)
@@ -140,12 +148,16 @@ class Compositor:
         paste(picture, np.ones((2, 2, 3), np.float32), around)
         paste(picture, recorded, box)
 
-    def _recorded(self, request: ViewRequest) -> Picture | None:
+    def _recorded_frame(self, request: ViewRequest) -> Frame:
         """The frame nearest in time, of the request's camera where it recorded any."""
+        frames = [f for f in self.capture.frames if f.camera == request.recording_camera]
+        return nearest_in_time(frames or self.capture.frames, request.time_us)
+
+    def _recorded(self, request: ViewRequest) -> Picture | None:
+        """The picture of the recorded frame; None beside another motion."""
         if not request.motion.is_recorded:
             return None
-        frames = [f for f in self.capture.frames if f.camera == request.recording_camera]
-        frame = nearest_in_time(frames or self.capture.frames, request.time_us)
+        frame = self._recorded_frame(request)
         if request.compare == SHARP and frame.sharp is not None:
             return self.capture.shown(self.capture.sharp(frame)).numpy()
         return self.capture.shown(self.capture.image(frame)).numpy()
