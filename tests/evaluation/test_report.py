@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -114,6 +115,23 @@ def test_page_is_one_file_without_any_request_and_hostile_names_stay_text(tiny_c
     assert not re.search(r"url\(|@import", text)
     assert sum(HOSTILE_NAME in data for data in parsed.text) >= 2
     assert sum(HOSTILE in data for data in parsed.text) >= 2
+
+
+@pytest.mark.parametrize(
+    ("planned", "nominal", "said"),
+    [
+        (2000, 15_000.0, "12\u202f345, the whole schedule (planned for 2\u202f000)"),
+        (40_000, 4_500.0, "12\u202f345, 30 % of the schedule (planned for 40\u202f000)"),
+        (12_345, 15_000.0, "12\u202f345"),
+        (2000, None, "12\u202f345"),
+    ],
+)
+def test_steps_and_the_schedule_are_one_statement(tiny_capture, tmp_path, planned, nominal, said):
+    """Steps of a shortened run stood beside the setting, which names the planned ones."""
+    source = evaluated(tiny_capture(), tmp_path)
+    last = {"iteration": 12345, "nominal": nominal}
+    source = replace(source, config={"iterations": planned}, log=[*source.log, last])
+    assert f"<dt>iterations</dt><dd>{said}</dd>" in page(source)
 
 
 def test_page_of_a_trained_run_ends_with_commands_for_its_folder(tiny_capture, tmp_path):

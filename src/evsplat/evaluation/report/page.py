@@ -21,6 +21,7 @@ from evsplat.evaluation.report.frames import frame_by_frame, test_frames
 from evsplat.evaluation.report.made import films_and_pages
 from evsplat.evaluation.report.source import Source
 from evsplat.evaluation.splits import words_of
+from evsplat.methods.settings import NOMINAL_ITERATIONS
 from evsplat.pages import (
     Embedder,
     data_uri,
@@ -84,7 +85,7 @@ def _header(source: Source) -> str:
     facts = [
         ("method", metrics["method"]),
         ("trained for", None if seconds is None else duration(seconds)),
-        ("iterations", _count(metrics.get("iteration"))),
+        ("iterations", _iterations(source)),
         ("device", metrics.get("device")),
         ("body poses", "found by evsplat" if metrics.get("poses") else None),
         ("Gaussians, person", _count(gaussians.get("human"))),
@@ -101,6 +102,18 @@ def _header(source: Source) -> str:
         f'<header><p class="kicker">evsplat · report</p><h1>{escape(metrics["capture"])}</h1>'
         f'<p class="lead">{_summary(metrics)}</p><dl class="facts">{listed}</dl></header>'
     )
+
+
+def _iterations(source: Source) -> str | None:
+    """Steps made; where the settings plan for others, also how much of the schedule they were."""
+    made, planned = source.metrics.get("iteration"), source.config.get("iterations")
+    last = source.log[-1] if source.log else {}
+    progress = last.get("nominal") if last.get("iteration") == made else None
+    if planned in (None, made) or progress is None:
+        return _count(made)
+    share = progress / NOMINAL_ITERATIONS
+    how_much = "the whole schedule" if share >= 1 else f"{100 * share:.0f} % of the schedule"
+    return f"{_count(made)}, {how_much} (planned for {_count(planned)})"
 
 
 def _summary(metrics: dict[str, Any]) -> str:

@@ -26,8 +26,9 @@ _DRAWN = {
     "psnr": _NUMBER,
     "human": _NUMBER,
     "scene": _NUMBER,
+    "nominal": _NUMBER,
 }
-"""What curves are drawn of, where a line of log.jsonl has it."""
+"""What is shown of a line of log.jsonl, where it has it."""
 
 
 @dataclass(frozen=True)
