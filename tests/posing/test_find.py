@@ -66,6 +66,8 @@ def test_a_capture_without_poses_gets_some(unposed, tmp_path):
     assert track.errors is not None
     assert track.errors.source == "estimated"
     assert (track.errors.joint_rad.max(1) > 0).all()
+    assert f"{len(track.times_us)} key poses from {len(new.train_frames)} frames; " in found.summary
+    assert len(repr(found)) < 1000 and "array" not in repr(found)
     for own, stored in zip(found.track.at(mids), track.at(mids), strict=True):
         np.testing.assert_allclose(own, stored, atol=1e-4)
     made = new.provenance["poses"]

@@ -57,6 +57,17 @@ def test_facts_of_a_run_have_their_shape(trained, run, facts):
         assert str(run / "versions.json") in refused(call)
 
 
+def test_a_run_is_printed_in_a_few_words(trained):
+    assert len(repr(load_run(trained[1]))) < 1000
+
+
+def test_facts_that_are_gone_are_told_with_what_to_do(trained, run):
+    (run / "versions.json").unlink()
+    for call in (lambda: load_run(run), lambda: train(trained[0], out=run, resume=True)):
+        said = f"{run / 'versions.json'}: file not found; restore the file, or train again."
+        assert refused(call) == said
+
+
 @pytest.mark.parametrize("metrics", ["[]", '{"capture": 1}'])
 def test_a_report_of_other_figures_is_none(run, metrics):
     (run / "metrics.json").write_text(metrics)

@@ -58,11 +58,11 @@ class FoundPoses:
 
     path: Path
     """The capture with them."""
-    track: BodyTrack
+    track: BodyTrack = field(repr=False)
     """Key poses at all frames and at the quarters between, with their errors."""
-    fitted: PoseFit
+    fitted: PoseFit = field(repr=False)
     """The motion behind them."""
-    landmarks: Landmarks
+    landmarks: Landmarks = field(repr=False)
     seconds: dict[str, float]
     """By stage: landmarks, with the pictures that they are in, fit, refinement."""
     summary: str
@@ -140,7 +140,7 @@ def find_poses(
             capture.name, motion.seen, motion.pictures, landmarks, track, fitted, made
         )
         write_text(making.folder / "poses.html", page)
-    said = _summary(out, track, landmarks, stages.seconds)
+    said = _summary(out, track, motion, stages.seconds)
     return FoundPoses(out, track, fitted, landmarks, stages.seconds, said)
 
 
@@ -394,11 +394,13 @@ def _set_focal(making: Derivation, focal_px: float) -> None:
         K[0][0] = K[1][1] = focal_px
 
 
-def _summary(out: Path, track: BodyTrack, landmarks: Landmarks, seconds: dict[str, float]) -> str:
-    assert track.errors is not None
+def _summary(out: Path, track: BodyTrack, motion: _Motion, seconds: dict[str, float]) -> str:
+    # a frame has several sharpened pictures
+    times = set(motion.landmarks.times_us.tolist())
+    frames = {one.frame.name for one in motion.pictures if one.time_us in times}
     stages = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
     return (
-        f"written: {out} ({len(track.times_us)} key poses from {len(landmarks.times_us)} pictures; "
-        f"{stages})\nlook at it: {out / 'poses.html'}\n"
+        f"written: {out} ({counted(len(track.times_us), 'key pose')} from "
+        f"{counted(len(frames), 'frame')}; {stages})\nlook at it: {out / 'poses.html'}\n"
         f"then: {command('train', out)}"
     )

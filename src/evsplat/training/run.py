@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import platform
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -138,13 +138,13 @@ class Run:
     """A trained run, ready to be drawn."""
 
     path: Path
-    config: MethodConfig
+    config: MethodConfig = field(repr=False)
     method: str
     policy: Terms
     """What training saw, as the capture could meet it."""
     capture: Capture
     """All of it, for evaluation and looking; without test frames where everything trained."""
-    reconstruction: GaussianReconstruction
+    reconstruction: GaussianReconstruction = field(repr=False)
     iteration: int
     train_seconds: float
     device: str
@@ -152,7 +152,7 @@ class Run:
     """Number of Gaussians, ``human`` and ``scene``."""
     human_only: bool
     """Whether the method learned nothing but the person and draws it on black."""
-    recording: Camera | None = None
+    recording: Camera | None = field(default=None, repr=False)
     """The camera at rest beside which the scene goes on, of methods whose scene does."""
 
     def beside(self) -> GaussianReconstruction:

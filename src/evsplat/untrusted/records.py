@@ -15,7 +15,9 @@ _WORDS |= {bool: "true or false", type(None): "null", list: "a list", dict: "an 
 
 
 def read_record(path: Path, shape: Shape, remedy: str) -> Any:
-    """JSON of a shape; another is a `DataError` that ends with ``remedy``."""
+    """JSON of a shape; another, or none at all, is a `DataError` that ends with ``remedy``."""
+    if not path.exists():
+        raise DataError(f"{path}: file not found; {remedy}.")
     value = read_json(path)
     wrong = misfit(value, shape)
     if wrong:
