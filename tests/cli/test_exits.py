@@ -204,3 +204,23 @@ def test_unwritable_output_is_said_before_the_work(tmp_path: Path, capsys):
             told = capsys.readouterr().err
             assert any(words in told for words in ("a file is where", "too long", "is no name"))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("verb", ["convert", "export", "evaluate"])
+def test_a_name_that_is_too_long_is_one_sentence(verb: str, tmp_path: Path, capsys):
+    """The system said so, with a traceback kept."""
+    long = tmp_path / ("x" * 300)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").touch()
+    (tmp_path / "e.csv").write_text("t,x,y,p\n")
+    before = sorted(tmp_path.rglob("*"))
+    arguments = {
+        "convert": ["convert", str(tmp_path / "e.csv"), f"{long}.h5"],
+        "export": ["export", str(tmp_path / "run"), "avatar", "--out", str(long)],
+        "evaluate": ["evaluate", str(long)],
+    }[verb]
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert told.endswith(": the name is too long for this disk; choose a shorter one.\n")
+    assert told.count("\n") == 1 and str(long) in told
+    assert sorted(tmp_path.rglob("*")) == before

@@ -194,7 +194,7 @@ def test_a_held_moment_is_one_time_from_many_places(lamp, tmp_path):
         ({"sensor": "davis346"}, "--sensor: goes with --show events"),
         ({"event_hz": 400.0, "show": "depth"}, "--event-hz: goes with --show events"),
         ({"what": "test", "slow": 4.0}, "--slow: films the sequence"),
-        ({"at": 99.0}, "--at 99: expected 0 to .* s from the beginning"),
+        ({"at": 99.0}, "--at 99: expected 0 to .* s from the first mid-exposure"),
         ({"at": -0.01}, "--at -0.01: expected 0 to"),
         ({"at": 0.1, "slow": 2.0}, "--slow"),
         ({"what": "test", "path": "orbit"}, "--path: films the sequence"),

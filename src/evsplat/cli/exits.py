@@ -1,5 +1,6 @@
 """From what goes wrong to a message and an exit code."""
 
+import errno
 import logging
 import os
 import signal
@@ -66,6 +67,8 @@ def _code(work: Callable[[], object], stops: "_Stops") -> int:
             return _stopped()
         if isinstance(error, EvsplatError):
             return _said(error)
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+            return _said(OutputError(f"{error.filename}: {why_not_written(error)}."))
         older = _older_module(error)
         if older is not None:
             return _said(older)

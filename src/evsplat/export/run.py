@@ -142,17 +142,19 @@ def _check_use(kind: Kind, options: ExportOptions) -> None:
     skeletal = kind in ("bvh", "skeleton")
     moving = kind in ("html", "avatar") or skeletal
     unused = {
-        "--time and --frame": moving and (options.time_s, options.frame) != (None, None),
+        "--time": moving and options.time_s is not None,
+        "--frame": moving and options.frame is not None,
         "--canonical": moving and options.canonical,
         "--up": moving and options.up is not None,
         "--low-pass": moving and options.low_pass is not None,
         "--motion": kind != "avatar" and not skeletal and options.motion is not None,
         "--fps": kind != "html" and options.fps is not None,
-        "--parts and --camera": skeletal and (options.parts, options.camera) != (None, None),
+        "--parts": skeletal and options.parts is not None,
+        "--camera": skeletal and options.camera is not None,
     }
-    for names, given_in_vain in unused.items():
+    for name, given_in_vain in unused.items():
         if given_in_vain:
-            raise ConfigError(f"{names}: format {kind} has no use for it; leave it out.")
+            raise ConfigError(f"{name}: format {kind} has no use for it; leave it out.")
     if options.parts == "scene" and (options.canonical or kind == "avatar"):
         raise ConfigError("--parts scene: the scene has no rest pose and no skeleton; use human.")
 

@@ -123,8 +123,9 @@ def _times(
     if film.at is not None:
         held = first + round(film.at * 1e6)
         if not first <= held <= last:
+            since = "start of the motion" if film.motion is not None else "first mid-exposure"
             raise ConfigError(
-                f"--at {film.at:g}: expected 0 to {(last - first) / 1e6:g} s from the beginning."
+                f"--at {film.at:g}: expected 0 to {(last - first) / 1e6:g} s from the {since}."
             )
         length = round((film.seconds or _HELD_SECONDS) * 1e6)
         clock = _even_steps(length, film.fps * oversampling)
