@@ -93,7 +93,8 @@ def test_hdf5_layouts_give_the_same_events(
 
 
 @pytest.mark.parametrize(
-    ("said", "per_us"), [("s", 1e-6), ("Milliseconds", 1e-3), (b"us", 1), ("ns", 1000)]
+    ("said", "per_us"),
+    [("s", 1e-6), ("Milliseconds", 1e-3), (b"us", 1), ("µs", 1), ("μs".encode(), 1), ("ns", 1000)],
 )
 @pytest.mark.parametrize("compound", [False, True])
 def test_the_unit_that_times_are_said_to_have_is_theirs(

@@ -226,7 +226,7 @@ def _unit(path: Path, times: h5py.Dataset) -> str | None:
         if name not in times.attrs:
             continue
         said = times.attrs[name]
-        word = said.decode("latin-1") if isinstance(said, bytes) else said
+        word = said.decode("utf-8", "replace") if isinstance(said, bytes) else said
         unit = unit_called(word.strip().lower()) if isinstance(word, str) else None
         if unit is not None:
             return unit

@@ -153,6 +153,7 @@ def assumed_order(order: Iterable[str]) -> str:
 
 def unit_called(word: str) -> str | None:
     """The time unit of a name or a sign; None where it is another."""
+    word = word.replace("µ", "u").replace("μ", "u")  # the sign of micro and the Greek letter
     fits = (unit for unit, name in _UNIT_WORDS.items() if word in (unit, name, f"{name}s"))
     return next(fits, None)
 
