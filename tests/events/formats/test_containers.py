@@ -12,7 +12,7 @@ import hdf5plugin
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as BagWriter
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -277,6 +277,35 @@ def test_ros2_folder_and_single_file(tmp_path: Path, storage: StoragePlugin, pac
         recording = open_recording(path)
         assert (recording.format, recording.width, recording.height) == ("rosbag", WIDTH, HEIGHT)
         assert same(recording.read(), s)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@pytest.mark.parametrize(
+    ("mode", "why"),
+    [
+        (CompressionMode.FILE, "packed by Zstandard: .* give a ROS 2 bag's folder"),
+        (CompressionMode.MESSAGE, "each of its messages is compressed .* give the folder"),
+    ],
+)
+def test_a_compressed_bag_is_read_as_a_folder_and_its_file_alone_is_told(
+    tmp_path: Path, storage: StoragePlugin, mode: CompressionMode, why: str
+) -> None:
+    """It was called damaged, and repaired by leaving out every message."""
+    s = random_stream(26, 1_003, first_us=1_000_000)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(PACKET_MSG, "event_camera_msgs/msg/EventPacket"))
+    kind = "event_camera_msgs/msg/EventPacket"
+    writer = FolderWriter(tmp_path / "bag", version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer as bag:
+        topic = bag.add_connection("/camera/events", kind, typestore=store)
+        for number, message in enumerate(_packets(store, s)):
+            bag.write(topic, number + 1, store.serialize_cdr(message, kind))
+    assert same(read_events(tmp_path / "bag"), s)
+    single = next(p for p in (tmp_path / "bag").iterdir() if p.suffix != ".yaml")
+    for repair in (False, True):
+        with pytest.raises(DataError, match=why):
+            read_events(single, repair=repair)
 
 
 def test_a_bag_without_events_says_what_it_holds(tmp_path: Path) -> None:

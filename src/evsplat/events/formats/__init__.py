@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 from evsplat.errors import ConfigError, DataError
-from evsplat.events.formats.base import Damage, Source, is_gzipped, peek
+from evsplat.events.formats.base import ZSTD_MAGIC, Damage, Source, is_gzipped, peek
 from evsplat.options import ReadOptions
 
 _HEAD_BYTES = 4096
@@ -95,6 +95,8 @@ def find_format(path: Path, name: str | None = None) -> Format:
         found_there = f"begins with {head[:16]!r}" if head else "is empty"
         if head[4:8] == b"ftyp":
             found_there = "a video, which 'evsplat import video' reads"
+        if head.startswith(ZSTD_MAGIC):
+            found_there = "packed by Zstandard: unzstd it first, or give a ROS 2 bag's folder"
         raise DataError(
             f"{path}: not a recording that evsplat reads ({found_there}); expected one of "
             f"{', '.join(FORMATS)}."

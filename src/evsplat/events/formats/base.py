@@ -23,6 +23,7 @@ SAY_UNIT = "--time-unit of 'evsplat convert'"
 """How a user says what a table does not, in the words of the verb that takes it."""
 BLOCK_EVENTS = 1 << 18
 """Events that a reader hands over at a time, about; bounds the memory of a pass."""
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BUFFER_BYTES = 1 << 16
 _SEEK_BYTES = 1 << 12
 # Kept of what was read, to know the beginning of another recording with all lines of its header.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from evsplat.errors import DataError
-from evsplat.events.formats.base import RawEvents, Source, parts_said, peek
+from evsplat.events.formats.base import ZSTD_MAGIC, RawEvents, Source, parts_said, peek
 from evsplat.events.formats.words import WordDecoder
 from evsplat.options import ReadOptions
 from evsplat.wording import counted
@@ -114,6 +114,11 @@ class RosBag(Source):
         connections = [c for c in bag.connections if c.topic == self._topic]
         is_ros1 = "rosbag1" in type(bag).__module__
         for number, (_, _, data) in enumerate(bag.messages(connections)):
+            if not is_ros1 and bytes(data[:4]) == ZSTD_MAGIC:
+                raise DataError(
+                    f"{self.path}: each of its messages is compressed by Zstandard, which only "
+                    "metadata.yaml beside it tells; give the folder that holds both."
+                )
             try:
                 yield number, _read_message(data, is_ros1, self._type in _PACKET_TYPES)
             except (struct.error, ValueError) as error:
