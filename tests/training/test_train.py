@@ -450,6 +450,17 @@ def test_a_run_is_drawn_by_the_same_cameras_and_poses_written_otherwise(tiny_cap
     assert load_run(out).iteration == 1
 
 
+def test_a_run_that_goes_on_with_its_capture_elsewhere_is_drawn_from_there(tiny_capture, tmp_path):
+    """It trained to the end, and then was refused as its capture was not at the old place."""
+    path = tiny_capture()
+    out = train(path, out=tmp_path / "run", iterations=1, overrides=small("evsplat"))
+    moved = path.rename(tmp_path / "moved")
+    train(moved, out=out, resume=True, iterations=2)
+    assert load_run(out).capture.path == moved
+    facts = read_json(out / "versions.json")
+    assert facts["capture_name"] == load_run(out).capture.name and facts["seed"] == 0
+
+
 def write_changed(path, change):
     """A capture with ``change`` made to what capture.json and body.npz hold."""
     document, body = (

@@ -102,7 +102,7 @@ def write_facts(
     write_json(
         folder.facts,
         {
-            "capture": str(seen.path.resolve()),
+            "capture": _place_of(seen),
             "capture_name": seen.name,
             "training_frames": _frames_of(seen),
             "up": _up_of(seen),
@@ -123,6 +123,16 @@ def write_facts(
             },
         },
     )
+
+
+def keep_place(folder: RunFolder, facts: dict[str, Any], seen: TrainingCapture) -> None:
+    """Record where the capture is that a run goes on with: it is drawn from there as well."""
+    if facts["capture"] != _place_of(seen):
+        write_json(folder.facts, {**facts, "capture": _place_of(seen)})
+
+
+def _place_of(seen: TrainingCapture) -> str:
+    return str(seen.path.resolve())
 
 
 @cache

@@ -50,6 +50,7 @@ from evsplat.training.loop import run_steps
 from evsplat.training.run import (
     RunFolder,
     check_capture,
+    keep_place,
     new_run_folder,
     read_config,
     seen_by_training,
@@ -154,6 +155,8 @@ def _trainer(capture: Capture, start: _Start, options: TrainOptions, device: str
     folder.truncate_log(clock.iteration)
     state_bytes = sum(value.nbytes for value in trainer.model.state_dict().values())
     try_target(folder.path, _KEPT_AND_NEW * _WITH_OPTIMISER * state_bytes)
+    if options.resume:
+        keep_place(folder, start.facts, seen)
     if loaded is None:
         found = composition.thresholds_found
         if not options.resume:
