@@ -147,6 +147,24 @@ def test_ctrl_c_finishes_the_step_saves_and_says_how_to_resume(tiny_capture, tmp
     assert load_run(out).iteration >= 2
 
 
+def test_ctrl_c_after_the_last_step_stops_before_the_evaluation(
+    tiny_capture, tmp_path, monkeypatch, capsys
+):
+    """What ends a training takes seconds, and a Ctrl-C in them had no effect."""
+    ending = Trainer.ending
+
+    def interrupted(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        return ending(self)
+
+    monkeypatch.setattr(Trainer, "ending", interrupted)
+    capture, out = tiny_capture(frames=10), tmp_path / "run"
+    asked = ["train", str(capture), "--out", str(out), "--iterations", "2"]
+    assert main([*asked, "--set", *small("evsplat")]) == 130
+    assert f"Go on with: evsplat train {capture} --out {out} --resume" in capsys.readouterr().err
+    assert load_run(out).iteration == 2 and not (out / "metrics.json").exists()
+
+
 def test_a_finished_run_goes_on_where_more_steps_are_asked_for(tiny_capture, tmp_path):
     capture = tiny_capture(frames=10)
     out = train(capture, out=tmp_path / "run", iterations=4, overrides=small("evsplat"))

@@ -77,10 +77,10 @@ def run_steps(trainer: Trainer, folder: RunFolder) -> None:
             showcase.show(trainer.snapshot)
         check_learned(trainer, clock.iteration - first)
         save()
+        if clock.iteration > 0 and not interrupted:
+            save(ending=True)  # once more: what was learned is safe whatever this takes
         if interrupted:
             raise Stopped(folder.path)
-        if clock.iteration > 0:
-            save(ending=True)  # once more: what was learned is safe whatever this takes
     if clock.iteration == 0:
         raise DataError(
             f"{folder.path}: no step was made in the time given; give more by --max-minutes."
