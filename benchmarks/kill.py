@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -234,14 +235,13 @@ def make_inputs(given: Path, place: Path) -> None:
     suite = {"name": "tiny", "iterations": 6, "rows": rows}
     suite["captures"] = [{"name": "capture", "path": str(given / "capture")}]
     (given / "suite.yaml").write_text(yaml.safe_dump(suite))
-    disk = Disk(place / "first")
-    ended = run(list(jobs(given)["train"].command), disk)
-    assert ended.code == 0, ended.said
-    shutil.copytree(disk.path / "run", given / "run")
-    ended = run(["evaluate", "run", "--device", "cpu"], disk)
-    assert ended.code == 0, ended.said
-    shutil.copytree(disk.path / "run", given / "evaluated")
-    disk.close()
+    with closing(Disk(place / "first")) as disk:
+        ended = run(list(jobs(given)["train"].command), disk)
+        assert ended.code == 0, ended.said
+        shutil.copytree(disk.path / "run", given / "run")
+        ended = run(["evaluate", "run", "--device", "cpu"], disk)
+        assert ended.code == 0, ended.said
+        shutil.copytree(disk.path / "run", given / "evaluated")
 
 
 class Bench:
@@ -251,24 +251,21 @@ class Bench:
         self.name, self.job, self.given, self.place = name, job, given, place
         self.inputs = digests(given)
         self.number = self.in_time = 0
-        disk = Disk(place / f"{name}-whole")
-        ended = run(list(job.command), disk, prepare=job.prepare)
-        assert ended.code == 0, f"{name}: {ended.said}"
-        self.expected = made(disk.path / job.out)
-        sizes = [file.stat().st_size for file in disk.path.rglob("*") if file.is_file()]
-        self.usual = Usual(ended.seconds, ended.calls, max(sizes))
-        disk.close()
+        with closing(Disk(place / f"{name}-whole")) as disk:
+            ended = run(list(job.command), disk, prepare=job.prepare)
+            assert ended.code == 0, f"{name}: {ended.said}"
+            self.expected = made(disk.path / job.out)
+            sizes = [file.stat().st_size for file in disk.path.rglob("*") if file.is_file()]
+            self.usual = Usual(ended.seconds, ended.calls, max(sizes))
         print(f"{name}: {ended.seconds:.2f} s, {ended.calls} calls that write", flush=True)
 
     def interrupted(self, what: Interruption) -> list[str]:
         """Run, interrupt, run again; what is wrong."""
         self.number += 1
-        disk = Disk(self.place / f"{self.name}-{self.number}")
-        try:
-            return self._interrupted(what, disk)
-        finally:
-            disk.close()
-            shutil.rmtree(disk.path, ignore_errors=True)
+        with closing(Disk(self.place / f"{self.name}-{self.number}")) as disk:
+            wrong = self._interrupted(what, disk)
+        shutil.rmtree(disk.path, ignore_errors=True)
+        return wrong
 
     def _interrupted(self, what: Interruption, disk: Disk) -> list[str]:
         job = self.job
