@@ -338,6 +338,15 @@ def test_the_edge_of_what_was_recorded_is_soft_from_wherever_else_it_is_seen(
     assert all(room.recording is capture.camera_at("main", 0) for room in rooms)
 
 
+def test_films_are_of_any_size(tiny_capture, monkeypatch):
+    capture = load_capture(tiny_capture())
+    made = _Lamp(load_body_track(capture))
+    monkeypatch.setattr(_Lamp, "at_any_size", lambda _: made)
+    for path in (None, "orbit"):
+        plan = FilmPlan.of(Film(path=path), capture, _Lamp(load_body_track(capture)))
+        assert plan.reconstruction is made
+
+
 def test_a_film_stops_at_the_first_picture_that_cannot_be_kept(lamp, tmp_path, monkeypatch):
     """Pictures are written beside the drawing of the next ones, which must not go on for hours."""
     whole = render_run(lamp.run, fps=200, out=tmp_path / "whole")

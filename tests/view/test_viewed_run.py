@@ -71,6 +71,16 @@ def test_a_still_picture_is_that_of_the_run_bit_for_bit(run):
         assert np.array_equal(found, expected)
 
 
+def test_a_window_with_more_pixels_than_were_recorded_shows_gaussians_as_wide(run):
+    camera, time_us = next(_views(run))
+    made = replace(run.reconstruction, recorders=(camera,))
+    viewed = ViewedRun(replace(run, reconstruction=made), "it")
+    window = camera.resized(3 * camera.width, 3 * camera.height)
+    found = viewed.picture(window, time_us, Motion(), Look(), draft=False)
+    assert np.array_equal(found, made.at_any_size().render(window, [time_us]).rgb[0].numpy())
+    assert not np.array_equal(found, made.render(window, [time_us]).rgb[0].numpy())
+
+
 def test_drafts_of_a_view_that_stands_still_become_its_picture(run):
     viewed, look, motion = ViewedRun(run, "it"), Look(), Motion()
     (camera, first), (_, second), *_ = _views(run)
