@@ -99,8 +99,7 @@ def main(run: Path) -> None:
         fps=12.0,
         size=FILM_PX,
     )
-    around = {"motion": "spin", "path": "orbit", "fps": 12.0}
-    render_run(run, out=OUT / "film.webp", size=FILM_PX, **around)
+    render_run(run, out=OUT / "film.webp", path="orbit", motion="spin", fps=12.0, size=FILM_PX)
 
 
 if __name__ == "__main__":
