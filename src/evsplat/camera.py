@@ -76,6 +76,11 @@ class Camera:
         homogeneous = in_camera @ self.K.to(points).T
         return homogeneous[..., :2] / depth[..., None], depth
 
+    def depth(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """z of world points alone, metres; negative behind the camera."""
+        world_to_camera = self.world_to_camera.to(points)
+        return points @ world_to_camera[2, :3] + world_to_camera[2, 3]
+
     def pixels(
         self, points: Float[Tensor, "*N 3"]
     ) -> tuple[Int[Tensor, "*N"], Int[Tensor, "*N"], Float[Tensor, "*N"], Bool[Tensor, "*N"]]:

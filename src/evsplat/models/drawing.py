@@ -132,8 +132,7 @@ def draw_depth(
 
 
 def _showing_depth(layer: Splats, camera: Camera) -> Splats:
-    pose = camera.world_to_camera
-    return replace(layer, channels=(layer.means @ pose[2, :3] + pose[2, 3])[..., None])
+    return replace(layer, channels=camera.depth(layer.means)[..., None])
 
 
 def shadowed_scene(layers: Layers) -> Splats:

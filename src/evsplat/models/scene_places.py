@@ -98,9 +98,8 @@ class ScenePlaces:
 
 def scene_depth(layers: WithScene, camera: Camera) -> Float[Tensor, "H W 2"]:
     """Of each pixel: z of its scene (metres) times the scene's share of it, and that share."""
-    scene, pose = layers.scene, camera.world_to_camera
-    depth = (scene.means @ pose[2, :3] + pose[2, 3])[..., None]
-    shown = replace(scene, channels=torch.cat([depth, torch.ones_like(depth)], -1))
+    depth = camera.depth(layers.scene.means)[..., None]
+    shown = replace(layers.scene, channels=torch.cat([depth, torch.ones_like(depth)], -1))
     return render(shown, camera, low_pass=layers.low_pass).image[0]
 
 

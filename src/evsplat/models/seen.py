@@ -167,12 +167,9 @@ def _hiding(layers: Layers, camera: Camera) -> Splats | None:
 
     Those behind all of the person change nothing of what is seen of them, and are most of a scene.
     """
-    pose = camera.world_to_camera
     if layers.human.means.shape[1] == 0:  # all of the person was pruned, or changed class
         return None
-    person, scene = (
-        layer.means @ pose[2, :3] + pose[2, 3] for layer in (layers.human, layers.scene)
-    )
+    person, scene = (camera.depth(layer.means) for layer in (layers.human, layers.scene))
     nearer = (scene <= person.max()).any(0)
     if not bool(nearer.any()):
         return None

@@ -38,8 +38,7 @@ def widened(layer: Splats, low_pass: float, camera: Camera, recorders: Sequence[
 
 def _pixels(points: Float[Tensor, "*T N 3"], camera: Camera) -> Float[Tensor, "*T N"]:
     """Size of a camera's pixels at each point, metres; 0 behind it."""
-    pose, focal = camera.world_to_camera.to(points), camera.K.diagonal()[:2].prod().sqrt()
-    return ((points @ pose[2, :3] + pose[2, 3]) / focal).clamp_min_(0)
+    return (camera.depth(points) / camera.K.diagonal()[:2].prod().sqrt()).clamp_min_(0)
 
 
 def _recorded_pixels(
